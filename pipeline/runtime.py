@@ -7,12 +7,12 @@ import os
 import socket
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
 from loky import cpu_count
 
-from levelproof.pipeline.compiled import remove_damaged
 from levelproof.pipeline.owned import own_folder
 
 CACHE_VARIABLE = "LEVELPROOF_CACHE_DIR"
@@ -25,6 +25,7 @@ XLA_FLAGS = (
 # NPROC and PJRT_NPROC set the size of XLA's pool; numpy's libraries read the others.
 THREADS = ("NPROC", "PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 NO_GPU = "JAX cannot use one here, as it can with levelproof's extra `gpu`"
+LAST_CHECK = "looked"  # file beside the programs, touched when a check begins; programs older than it were readable
 CLAIM_SECONDS = 2.0  # s for which a worker tries to claim a core
 CLAIMS: list[socket.socket] = []  # sockets that mark this process's core as taken
 # Settings of JAX that change results or reject this code; a user's environment or configuration may have set them
@@ -83,6 +84,27 @@ def prepare_jax(core: int | None = None, device: Literal["cpu", "gpu"] | None = 
     jax.config.update("jax_compilation_cache_dir", str(programs))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def remove_damaged(folder: Path) -> None:
+    """Delete the programs that JAX cannot read, of those that changed since the last check.
+
+    JAX writes a program in place and never replaces one, so a program that a killed process or a full disk left
+    half-written would be recompiled, with a warning, at every start.
+    """
+    from jax._src.compilation_cache import decompress_executable  # as JAX reads them, with the library that it chooses
+
+    last, new = folder / LAST_CHECK, folder / f".{LAST_CHECK}.{os.getpid()}"
+    with suppress(OSError):  # the folder is not writable: JAX itself warns of damaged programs
+        new.touch()
+        since = last.stat().st_mtime_ns if last.exists() else 0
+        for path in folder.glob("*-cache"):
+            try:
+                if path.stat().st_ctime_ns >= since:  # ns; ctime, because a copy may keep its original's mtime
+                    decompress_executable(path.read_bytes())
+            except Exception:  # each compression library raises its own type
+                path.unlink(missing_ok=True)
+        new.replace(last)
 
 
 def jax_sees_a_gpu() -> bool:

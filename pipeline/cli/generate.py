@@ -38,8 +38,7 @@ def run(arguments: argparse.Namespace) -> Exit:
     from rich.console import Console
 
     from levelproof.configs.compose import compose_job
-    from levelproof.pipeline.jobs.generate import generate
-    from levelproof.pipeline.jobs.level_files import generate_from_files
+    from levelproof.pipeline.jobs.generate import generate, generate_from_files
 
     job = compose_job(arguments.settings)
     make = generate_from_files if job.level_files else generate

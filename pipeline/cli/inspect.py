@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     import sys
 
-    from levelproof.pipeline.look.rows import RowQuery, write_csv
+    from levelproof.pipeline.look.query import RowQuery, write_csv
 
     columns = [name.strip() for name in arguments.columns.split(",")] if arguments.columns else None
     asked = RowQuery(arguments.where, columns, arguments.sort, arguments.limit)

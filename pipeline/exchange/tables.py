@@ -12,7 +12,7 @@ from levelproof.physics.types import Size
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.store.contents import ContentsError, check_numbers, level_fields
 from levelproof.pipeline.store.fields import arrays_of, tree_of
-from levelproof.pipeline.store.schema import FieldSpec
+from levelproof.pipeline.store.formats import FieldSpec
 
 
 def column_fields(size: Size) -> dict[str, FieldSpec]:

@@ -4,7 +4,7 @@ import os
 import re
 import socket
 
-from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.errors import Failure, LevelproofError, UserError
 
 CONNECT_SECONDS = 5.0  # s within which a cluster must accept a connection
 
@@ -34,8 +34,8 @@ def no_cluster(reason: str) -> UserError:
     )
 
 
-def cannot_start(error: Exception) -> Exception:
-    """Return the error for the user in place of that of `ray.init`; the same one if its cause is unknown."""
+def cannot_start(error: Exception) -> LevelproofError | None:
+    """Return the error for the user in place of that of `ray.init`; None if its cause is unknown."""
     reason = (str(error).strip().splitlines() or ["no message"])[0]
     if isinstance(error, ConnectionError):
         return no_cluster(reason)
@@ -46,4 +46,4 @@ def cannot_start(error: Exception) -> Exception:
         )
     if isinstance(error, OSError):
         return Failure(f"Ray cannot start ({error}): fix that, or set RAY_TMPDIR to another folder.")
-    return error
+    return None

@@ -33,9 +33,8 @@ from levelproof.levelgen.level import size_of
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.jobs.address import cannot_start, ray_address, require_reachable
 from levelproof.pipeline.jobs.likeness import Program, mismatch, program_of, with_absolute_paths
-from levelproof.pipeline.jobs.meters import Meters
 from levelproof.pipeline.jobs.places import bytes_of_worker, memory_to_reserve, shortage, workers_by_machine
-from levelproof.pipeline.jobs.progress import STOPPING, Board
+from levelproof.pipeline.jobs.progress import STOPPING, Board, Meters
 from levelproof.pipeline.jobs.schedule import Order, Round, Scheduler, Settle, UnitOutcome, levels_text, until_report
 from levelproof.pipeline.runtime import NO_GPU, jax_sees_a_gpu, own_core, own_cores, prepare_jax
 from levelproof.pipeline.stopping import Stop
@@ -369,7 +368,9 @@ def connected() -> Iterator[None]:
         try:
             ray.init(log_to_driver=False, logging_level=logging.FATAL, **settings)
         except Exception as error:
-            raise cannot_start(error) from error
+            if known := cannot_start(error):
+                raise known from error
+            raise
         try:
             yield
         finally:

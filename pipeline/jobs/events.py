@@ -10,7 +10,7 @@ from typing import Any
 
 from levelproof.pipeline.jobs.progress import Board, Tally
 from levelproof.pipeline.jobs.schedule import Scheduler, UnitOutcome
-from levelproof.pipeline.store.events import Event, new_run, tell
+from levelproof.pipeline.store.event_files import Event, new_run, write_events
 
 EVERY = 5.0  # s between two published states
 MAX_EVENTS = 500  # latest events that are kept, besides the start of the run
@@ -86,7 +86,7 @@ def recording(
     run = new_run(split)
 
     def publish(events: Sequence[Event]) -> None:
-        tell(run, events)
+        write_events(run, events)
         log(events)
 
     events = Events(board.tally, scheduler, command, publish)

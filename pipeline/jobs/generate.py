@@ -1,7 +1,10 @@
-"""The job of `levelproof generate`: plan the missing units, run them on an executor, report to the user."""
+"""The jobs of `levelproof generate`: plan the missing units, run them on an executor, report to the user."""
 
+import multiprocessing
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,13 +15,14 @@ from rich.console import Console
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.labels import Label
 from levelproof.experts.steps import EnvSteps
-from levelproof.pipeline.errors import Exit, Failure
+from levelproof.pipeline.errors import Exit, Failure, UserError
 from levelproof.pipeline.jobs.events import Events, recording
 from levelproof.pipeline.jobs.log import logged, require_library
 from levelproof.pipeline.jobs.progress import Board, Tally, say
 from levelproof.pipeline.jobs.schedule import Scheduler, UnitOutcome, WorkUnit, levels_text, schedule
 from levelproof.pipeline.jobs.seal import Sealer, sealing
-from levelproof.pipeline.runtime import cache_folder
+from levelproof.pipeline.read.level_files import Listing, levels_below
+from levelproof.pipeline.runtime import cache_folder, prepare_jax
 from levelproof.pipeline.stopping import Stop, stoppable
 from levelproof.pipeline.store import quarantine
 from levelproof.pipeline.store.checkpoints import require_same_experts
@@ -59,45 +63,98 @@ def generate(
     require_library(job.log)
     cache_folder()  # checked here, because Ray wraps a worker's error in many lines
     require_same_experts(job)
-    with stoppable() as stop, writing(job, partial(say, console), repaired) as (split, manifest):
+    tell = partial(say, console)
+    with stoppable() as stop, writing(job, tell, repaired) as (split, manifest):
         chosen = [*origins] if origins else (job.level_ids if level_ids is None else level_ids)
         wanted = ascending(np.fromiter(chosen, np.int64, len(chosen)))
-        is_done = np.isin(manifest.level_ids, wanted)
-        done = manifest.level_ids[is_done]
+        done = manifest.level_ids[np.isin(manifest.level_ids, wanted)]
         require_same_levels(split, origins or {}, done)
         left = len(wanted) - len(done)
         scheduler = schedule(chosen, done, left, job.levels_per_unit, job.unit is None, origins)
-        quarantine.drop_notes(split, manifest.level_ids)
-        prune_paused(split, manifest.level_ids, partial(say, console))
+        _tidy(split, manifest, tell)
         if not repaired:
             note_job(split, job, command, merged(runs(wanted), runs(manifest.level_ids)))
+        spent = ""
         if scheduler.waiting:
-            solved = manifest.counts(is_done).get(Label.SOLVED, 0)
-            board = Board(Tally(len(wanted), len(done), solved), console)
-            already = f", {len(done)} are there already" if len(done) else ""
-            each = f"{many(len(wanted), 'level')} of size {job.size}, {job.budget} env steps each"
-            board.say(f"{each}, into {as_typed(split)}{already}")
-            try:
-                with (
-                    logged(job, split, board.say) as log,
-                    board.shown(),
-                    sealing(split, manifest.counting, board.say) as sealer,
-                    recording(split, board, scheduler, shlex.join(command), log) as events,
-                ):
-                    _work(job, split, scheduler, board, sealer, events, stop)
-            except KeyboardInterrupt:
-                done = f"{board.tally.done:,} of {many(len(wanted), 'level')} committed"
-                board.say(f"Stopped: {done}; run the same command to continue.")
-                raise
+            tally = _make(job, split, manifest, wanted, scheduler, command, console, stop)
             manifest = read_manifest(split, ["label", "env_steps"], compact=True)
-            quarantine.drop_notes(split, manifest.level_ids)
-            prune_paused(split, manifest.level_ids, board.say)
-            spent = _spent(manifest, np.setdiff1d(wanted, done), board.tally.spent) if board.tally.spent.shown else ""
+            _tidy(split, manifest, tell)
+            spent = _spent(manifest, np.setdiff1d(wanted, done), tally.spent) if tally.spent.shown else ""
         else:
             print(f"Nothing to do: {many(len(wanted), 'level')} there already.")
-            spent = ""
         _closing(split, manifest, wanted, scheduler.quarantined, spent)
     return Exit.QUARANTINED if scheduler.quarantined else Exit.DONE
+
+
+def generate_from_files(job: JobConfig, command: Sequence[str], console: Console) -> Exit:
+    """Label the levels of `job.level_files`, one size after another; report and leave out unusable files.
+
+    Returns INPUT if a file was left out, else the largest exit code of the splits.
+
+    Raises:
+        UserError: no file can be used; or see `generate`.
+        Failure: see `generate`.
+    """
+    folder = Path(job.level_files).expanduser()
+    if job.executor == "inline":
+        prepare_jax(device=job.device)
+        listing = levels_below(folder, job)
+    else:
+        listing = _list_in_subprocess(folder, job)
+    for sentence in (*listing.copies, *listing.refused):
+        say(console, sentence)
+    if not listing.levels:
+        raise UserError(f"None of the level files in {folder} can be used, for the reasons above: fix one of them.")
+    exits = [
+        generate(replace(job, size=size), command, console, origins=origins) for size, origins in listing.levels.items()
+    ]
+    if listing.refused:
+        say(console, f"{len(listing.refused)} of the level files in {folder} were left out, for the reasons above.")
+        return Exit.INPUT
+    return max(exits)
+
+
+def _tidy(split: Path, manifest: Manifest, tell: Callable[[str], None]) -> None:
+    """Delete notes on failures and checkpoints of committed levels."""
+    quarantine.drop_notes(split, manifest.level_ids)
+    prune_paused(split, manifest.level_ids, tell)
+
+
+def _make(
+    job: JobConfig,
+    split: Path,
+    manifest: Manifest,
+    wanted: np.ndarray,
+    scheduler: Scheduler,
+    command: Sequence[str],
+    console: Console,
+    stop: Stop,
+) -> Tally:
+    """Make the levels that the scheduler holds; report progress, events and seals. Returns the counts at the end."""
+    is_done = np.isin(manifest.level_ids, wanted)
+    count, there = many(len(wanted), "level"), int(is_done.sum())
+    tally = Tally(len(wanted), there, manifest.counts(is_done).get(Label.SOLVED, 0))
+    board = Board(tally, console)
+    already = f", {there} are there already" if there else ""
+    board.say(f"{count} of size {job.size}, {job.budget} env steps each, into {as_typed(split)}{already}")
+    try:
+        with (
+            logged(job, split, board.say) as log,
+            board.shown(),
+            sealing(split, manifest.counting, board.say) as sealer,
+            recording(split, board, scheduler, shlex.join(command), log) as events,
+        ):
+            _work(job, split, scheduler, board, sealer, events, stop)
+    except KeyboardInterrupt:
+        board.say(f"Stopped: {tally.done:,} of {count} committed; run the same command to continue.")
+        raise
+    return tally
+
+
+def _list_in_subprocess(folder: Path, job: JobConfig) -> Listing:
+    """Call `levels_below` in another process: Ray forks this one, which must not have started JAX before."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), prepare_jax, (None, "cpu")) as process:
+        return process.submit(levels_below, folder, job).result()
 
 
 def _work(

@@ -10,7 +10,7 @@ from typing import Protocol
 
 from levelproof.configs.schema import JobConfig
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.store.events import Event
+from levelproof.pipeline.store.event_files import Event
 from levelproof.pipeline.store.remote import is_remote
 
 LIBRARIES = {"tensorboard": "tensorboardX", "wandb": "wandb"}

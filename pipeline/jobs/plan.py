@@ -23,10 +23,10 @@ from levelproof.pipeline.jobs.generate import generate
 from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.runtime import own_cores, prepare_jax
-from levelproof.pipeline.store.events import events_of, runs_in
+from levelproof.pipeline.store.event_files import events_of, runs_in
+from levelproof.pipeline.store.formats import Encoding
 from levelproof.pipeline.store.layout import split_path
 from levelproof.pipeline.store.manifest import read_manifest
-from levelproof.pipeline.store.schema import Encoding
 from levelproof.pipeline.store.scratch import scratch
 from levelproof.pipeline.store.shard import stored_bytes, write_shard
 from levelproof.pipeline.words import duration, many

@@ -1,9 +1,11 @@
-"""Progress of a job, on stderr: a bar on a terminal, plain lines elsewhere. Knows nothing of workers."""
+"""Progress of a job: a bar or plain lines on stderr, and gauges. Knows nothing of workers or Ray."""
 
 import time
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
@@ -125,3 +127,17 @@ class Board:
         self.tally.ended(unit, summary)
         if summary:
             self.refresh(0.0 if self.tally.done == self.tally.levels else LINE_AFTER)
+
+
+class Meters:
+    """Prometheus gauges of one split's progress, exported through the cluster's own metrics."""
+
+    def __init__(self, split: Path, gauge: Callable[[str, str, tuple[str, ...]], Any]) -> None:
+        """`gauge` creates a gauge from its name, its description and the names of its tags."""
+        self._split = {"split": "/".join(split.parts[-2:])}
+        meanings = {"levels": "levels committed", "solved": "of them solved", "env_steps": "env steps of this run"}
+        self._gauges = {name: gauge(f"levelproof_{name}", what, ("split",)) for name, what in meanings.items()}
+
+    def show(self, tally: Tally) -> None:
+        for name, value in {"levels": tally.done, "solved": tally.solved, "env_steps": tally.steps}.items():
+            self._gauges[name].set(value, self._split)

@@ -22,7 +22,7 @@ from levelproof.pipeline.store.job_note import note_job, sound_note
 from levelproof.pipeline.store.layout import EXPERTS, data_paths
 from levelproof.pipeline.store.locks import without_commits
 from levelproof.pipeline.store.mend import take_out
-from levelproof.pipeline.store.runs import merged, runs, told_levels
+from levelproof.pipeline.store.runs import merged, runs, runs_text
 from levelproof.pipeline.store.split import locked, taken
 from levelproof.pipeline.verify.findings import Findings
 
@@ -144,10 +144,10 @@ def _not_regenerated(findings: Findings) -> list[str]:
     sentences = []
     for reason in dict.fromkeys(findings.unrepairable.values()):
         ids = [level_id for level_id, why in findings.unrepairable.items() if why == reason]
-        sentences.append(f"Not regenerated: {told_levels(runs(ids))}, for {reason}.")
+        sentences.append(f"Not regenerated: {runs_text(runs(ids))}, for {reason}.")
     ids = [i for i in findings.lost if from_files(findings.config or {}) and i not in findings.origins]
     if nameless := (findings.missing if from_files(findings.config or {}) else []) + runs(ids):
-        sentences.append(f"Not regenerated: {told_levels(nameless)}, whose level files no row names.")
+        sentences.append(f"Not regenerated: {runs_text(nameless)}, whose level files no row names.")
     return sentences
 
 

@@ -16,7 +16,7 @@ from levelproof.experts.steps import NO_SECONDS, EnvSteps, Seconds
 from levelproof.pipeline.jobs.sizing import UnitSize
 from levelproof.pipeline.store.layout import unit_name
 from levelproof.pipeline.store.origins import Origin
-from levelproof.pipeline.store.runs import ascending, runs, told_levels, without
+from levelproof.pipeline.store.runs import ascending, runs, runs_text, without
 
 # Maximum number of units that a worker has at once, by the failed attempts at each. Units with different numbers of
 # failures never share a worker. So a unit that kills its worker takes fewer others with it each time, and none that
@@ -338,4 +338,4 @@ def schedule(
 
 def levels_text(units: Iterable[WorkUnit]) -> str:
     """Describe the levels of units for people: `levels 0 to 31, 96 to 127`."""
-    return told_levels(runs([level_id for unit in units for level_id in unit.level_ids]))
+    return runs_text(runs([level_id for unit in units for level_id in unit.level_ids]))

@@ -18,7 +18,7 @@ from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store import seal as store
-from levelproof.pipeline.store.disk import told_of
+from levelproof.pipeline.store.disk import explaining_writes
 from levelproof.pipeline.store.job_note import note_density
 from levelproof.pipeline.store.layout import fragment_path, unit_name
 from levelproof.pipeline.store.manifest import Fragment, require_manifest, write_index
@@ -138,7 +138,7 @@ class Sealer:
         self._thread.shutdown()
 
     def _seal(self, group: list[Piece]) -> Piece:
-        with told_of(self._split):
+        with explaining_writes(self._split):
             return seal(self._split, group, self._check_stop)
 
     def _check_stop(self, _: int) -> None:

@@ -34,6 +34,7 @@ from levelproof.pipeline.read.level_files import LevelUnavailable, levels_at
 from levelproof.pipeline.store.checkpoints import SourceUnseen, experts_for, save_experts
 from levelproof.pipeline.store.disk import refusal
 from levelproof.pipeline.store.fields import arrays_of, unlike_fields
+from levelproof.pipeline.store.formats import Encoding
 from levelproof.pipeline.store.layout import Attempt, new_attempt
 from levelproof.pipeline.store.leases import LeaseLost
 from levelproof.pipeline.store.locks import LockRefused, committing
@@ -43,7 +44,6 @@ from levelproof.pipeline.store.paused import CheckpointUnread, drop_paused, load
 from levelproof.pipeline.store.provenance import device, versions
 from levelproof.pipeline.store.publish import committed_levels
 from levelproof.pipeline.store.remote import is_remote
-from levelproof.pipeline.store.schema import Encoding
 from levelproof.pipeline.store.shard import write_shard
 
 

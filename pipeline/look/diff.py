@@ -20,7 +20,7 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look import cost
 from levelproof.pipeline.look.inspect import QUANTILES, SPENT
 from levelproof.pipeline.read.select import columns_in, select
-from levelproof.pipeline.store.manifest import differences, require_manifest, told
+from levelproof.pipeline.store.manifest import changes_text, differences, require_manifest
 from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.words import number
 
@@ -179,7 +179,7 @@ def _print(facts: dict[str, Any], console: Console) -> None:
         f"{count:,} only in {split}" for count, split in zip(facts["alone"], facts["splits"], strict=True) if count
     ]
     say(f"{facts['levels']:,} levels are in both" + (f" ({', '.join(alone)})." if alone else "."))
-    say(f"Settings that differ: {told(facts['settings']) or 'none'}.")
+    say(f"Settings that differ: {changes_text(facts['settings']) or 'none'}.")
     for name, unit in (("env_steps", "env steps"), ("seconds", "seconds")):
         if (more := facts[f"{name}_for_one_more"]) is not None:
             say(f"{more * gained:+,.0f} {unit} for {gained:+,} solved levels: {number(more)} per extra level.")

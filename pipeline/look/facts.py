@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from levelproof.pipeline.look import cost, duplicates
-from levelproof.pipeline.look.things import ENTITIES
+from levelproof.pipeline.look.entities import ENTITIES
 
 NAMES = 33  # characters; column where the text of a line begins
 REASONS = 4  # shown per label; the rest are only counted

@@ -17,11 +17,11 @@ from levelproof.configs.compose import name_and_hash
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.labels import DIVERGED, Label
 from levelproof.pipeline.look import cost, duplicates
+from levelproof.pipeline.look.entities import solved_by_entities
 from levelproof.pipeline.look.facts import print_facts
 from levelproof.pipeline.look.figures import Share
+from levelproof.pipeline.look.query import ALL_ROWS, SHOWN, RowQuery, ids_of, rows_of
 from levelproof.pipeline.look.reasons import kinds_of_reasons
-from levelproof.pipeline.look.rows import ALL_ROWS, SHOWN, RowQuery, ids_of, rows_of
-from levelproof.pipeline.look.shares import solved_by_entities
 from levelproof.pipeline.read.levels import distribution_of
 from levelproof.pipeline.read.select import columns_in, select
 from levelproof.pipeline.store.layout import data_path

@@ -8,7 +8,7 @@ import pyarrow as pa
 from levelproof.experts.labels import TRAINED, Label
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look.figures import draw_panels
-from levelproof.pipeline.look.rows import RowQuery
+from levelproof.pipeline.look.query import RowQuery
 from levelproof.pipeline.look.spread import spread
 from levelproof.pipeline.read.levels import writing_to
 from levelproof.pipeline.read.select import columns_in, select

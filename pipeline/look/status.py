@@ -12,7 +12,7 @@ from levelproof.pipeline.store.locks import is_written
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.quarantine import given_up
 from levelproof.pipeline.store.remote import as_typed
-from levelproof.pipeline.store.runs import inside, told_levels
+from levelproof.pipeline.store.runs import inside, runs_text
 from levelproof.pipeline.words import many
 
 
@@ -30,7 +30,7 @@ def status(split: Path, as_json: bool, say: Callable[[str], None]) -> None:
     counts = "".join(f", {count} {label}" for label, count in facts["labels"].items())
     print(f"{as_typed(split)}: {facts['done']:,} of {many(facts['wanted'], 'level')} committed{counts}.")
     for note, levels in facts["given_up"].items():
-        print(f"Given up: {told_levels(levels)}, for the reason in {as_typed(split / QUARANTINE / note)}")
+        print(f"Given up: {runs_text(levels)}, for the reason in {as_typed(split / QUARANTINE / note)}")
     if facts["running"]:
         print("A run is active.")
     elif facts["done"] < facts["wanted"]:

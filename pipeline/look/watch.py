@@ -16,7 +16,7 @@ from levelproof.configs.errors import readable
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look.status import read_status
 from levelproof.pipeline.outlet import has_reader
-from levelproof.pipeline.store.events import events_of, runs_in
+from levelproof.pipeline.store.event_files import events_of, runs_in
 from levelproof.pipeline.store.layout import EVENTS
 from levelproof.pipeline.store.locks import is_written
 from levelproof.pipeline.store.remote import as_typed

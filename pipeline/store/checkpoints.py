@@ -25,7 +25,7 @@ from levelproof.pipeline.owned import WRITABLE_BY_OTHERS, require_own
 from levelproof.pipeline.store.disk import flush, regular
 from levelproof.pipeline.store.fields import arrays_of
 from levelproof.pipeline.store.layout import EXPERTS, MANIFEST, data_path
-from levelproof.pipeline.store.manifest import differences, read_manifest, require_manifest, told
+from levelproof.pipeline.store.manifest import changes_text, differences, read_manifest, require_manifest
 from levelproof.pipeline.store.remote import require_folder
 
 COPY = "make a copy of your own of the split that continue_from names, or leave continue_from out"
@@ -183,7 +183,7 @@ def require_same_experts(job: JobConfig) -> None:
     changes.pop("budget", None)
     if changes:
         raise UserError(
-            f"Experts of {source.split} cannot continue with different settings ({told(changes)}): "
+            f"Experts of {source.split} cannot continue with different settings ({changes_text(changes)}): "
             "use the same ones, or leave out continue_from."
         )
     if config["budget"] >= job.env_steps:

@@ -23,8 +23,8 @@ from levelproof.physics.buffers import buffers_of
 from levelproof.physics.types import FIXED_POLYGONS, MAX_VERTICES, Size
 from levelproof.pipeline.store.density import KEY, kept
 from levelproof.pipeline.store.fields import arrays_of
+from levelproof.pipeline.store.formats import FLAT, ContentsError, Encoding, FieldSpec, field_table
 from levelproof.pipeline.store.packing import pack
-from levelproof.pipeline.store.schema import FLAT, ContentsError, Encoding, FieldSpec, field_table
 
 COUNTED = (  # fields with one entry per polygon, circle, joint and thruster, in the order of Size
     "level/model/n_vertices",

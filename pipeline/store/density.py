@@ -20,7 +20,7 @@ from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.rules import TaskState
 from levelproof.physics.types import State
 from levelproof.pipeline.store.fields import tree_of
-from levelproof.pipeline.store.schema import WIDE, Encoding, FieldSpec
+from levelproof.pipeline.store.formats import WIDE, Encoding, FieldSpec
 
 MOVES = "record/action", "record/done", "record/goal"
 LAST_DISTANCE = "record/last_distance"

@@ -70,7 +70,7 @@ def write_new(path: Path, data: bytes, mode: int = 0o666) -> None:
 
 
 @contextmanager
-def told_of(split: Path) -> Iterator[None]:
+def explaining_writes(split: Path) -> Iterator[None]:
     """Turn failed writes to a split in the `with` block into a sentence.
 
     Raises:

@@ -18,9 +18,9 @@ from levelproof.levelgen.level import size_of
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.bounds import DAMAGE, bounded
 from levelproof.pipeline.store.columns import COLUMNS, MANIFEST_VERSION, VERSIONS, completed
+from levelproof.pipeline.store.formats import CONFIG_KEY, DENSITIES_KEY, DIGESTS_KEY, HASH_KEY, SEALED_KEY, VERSION_KEY
 from levelproof.pipeline.store.layout import ids_of
 from levelproof.pipeline.store.remote import mended
-from levelproof.pipeline.store.schema import CONFIG_KEY, DENSITIES_KEY, DIGESTS_KEY, HASH_KEY, SEALED_KEY, VERSION_KEY
 
 FULL = (stored_as("full"),)
 DENSITIES = {stored_as(density, every) for density in get_args(Density) for every in KEYS_EVERY}

@@ -20,16 +20,16 @@ import pyarrow.parquet as pq
 from levelproof.configs.convert import flat
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.store import files
+from levelproof.pipeline.store.bar import with_bar
 from levelproof.pipeline.store.bounds import with_dictionaries
 from levelproof.pipeline.store.checksums import digests_below, with_own
 from levelproof.pipeline.store.columns import COLUMNS, MANIFEST_VERSION, schema_of
 from levelproof.pipeline.store.disk import flush, flush_entry, regular
+from levelproof.pipeline.store.formats import CONFIG_KEY, DENSITIES_KEY, DIGESTS_KEY, HASH_KEY, SEALED_KEY, VERSION_KEY
 from levelproof.pipeline.store.fragment import FULL, Fragment, read_fragment
 from levelproof.pipeline.store.layout import FRAGMENT, MANIFEST, Attempt, entries, ids_of
 from levelproof.pipeline.store.remote import INDEX, is_remote
 from levelproof.pipeline.store.runs import ascending
-from levelproof.pipeline.store.schema import CONFIG_KEY, DENSITIES_KEY, DIGESTS_KEY, HASH_KEY, SEALED_KEY, VERSION_KEY
-from levelproof.pipeline.store.shown import shown
 from levelproof.pipeline.urls import require_known
 
 MAX_SHOWN = 6  # differing settings that an error lists
@@ -194,7 +194,7 @@ def read_manifest(
     fragments = tuple(fragment for fragment, _ in parts)
     for fragment in fragments[1:]:
         if fragment.config_hash != fragments[0].config_hash:
-            changes = told(differences(fragments[0].config, fragment.config))
+            changes = changes_text(differences(fragments[0].config, fragment.config))
             raise Failure(
                 f"The split {split} mixes the configurations of {fragments[0].path.name} and {fragment.path.name} "
                 f"({changes}): move the fragments of one of them elsewhere, with their shards and experts of the same "
@@ -225,7 +225,7 @@ def _parts(
         for listing in range(MAX_LISTINGS):
             listed = entries(split, MANIFEST, FRAGMENT, DirEntry.is_file).items()
             new = [entry for entry in listed if entry not in found and _wanted(entry[0], level_ids)]
-            parts = list(shown(threads.map(read, (path for path, _ in new)), "fragments", len(new), MANY))
+            parts = list(with_bar(threads.map(read, (path for path, _ in new)), "fragments", len(new), MANY))
             found |= {entry: part for entry, part in zip(new, parts, strict=True) if part}
             if listing and all(part and not part[0].sealed for part in parts):
                 latest = {path: part for (path, _), part in found.items()}  # a path's file may have been replaced
@@ -342,7 +342,7 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, tup
     return {name: (a.get(name, "absent"), b.get(name, "absent")) for name in names}
 
 
-def told(changes: Mapping[str, tuple[Any, Any]]) -> str:
+def changes_text(changes: Mapping[str, tuple[Any, Any]]) -> str:
     """Describe the first MAX_SHOWN of `differences`."""
     parts = [f"{name} was {old}, now {new}" for name, (old, new) in list(changes.items())[:MAX_SHOWN]]
     return "; ".join(parts) + (f" and {len(changes) - MAX_SHOWN} more" if len(changes) > MAX_SHOWN else "")

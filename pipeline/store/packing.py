@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from levelproof.experts.config import RECORD_STEPS
-from levelproof.pipeline.store.schema import ALONG_TIME, FLAT, PACKED, FieldSpec
+from levelproof.pipeline.store.formats import ALONG_TIME, FLAT, PACKED, FieldSpec
 
 
 def pack(arrays: Mapping[str, np.ndarray], table: Sequence[FieldSpec]) -> dict[str, np.ndarray]:

@@ -53,7 +53,7 @@ def merged(*lists: Iterable[Sequence[int]]) -> list[tuple[int, int]]:
     return together
 
 
-def told_levels(runs: Sequence[Sequence[int]]) -> str:
+def runs_text(runs: Sequence[Sequence[int]]) -> str:
     """Describe runs for a message: `levels 0 to 31, 96 to 127`."""
     parts = [f"{first} to {last}" if last > first else f"{first}" for first, last in runs]
     more = f" and {len(parts) - MAX_SHOWN} more runs of levels" if len(parts) > MAX_SHOWN else ""

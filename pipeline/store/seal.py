@@ -12,13 +12,14 @@ from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pyarrow as pa
 
 from levelproof.configs.schema import Density, stored_as
 from levelproof.pipeline.store.checksums import altered
 from levelproof.pipeline.store.contents import ContentsError
-from levelproof.pipeline.store.convert import convert
 from levelproof.pipeline.store.files import remove
+from levelproof.pipeline.store.formats import Encoding
 from levelproof.pipeline.store.layout import (
     SHARDS,
     Attempt,
@@ -45,10 +46,10 @@ from levelproof.pipeline.store.manifest import (
 from levelproof.pipeline.store.merge import Place, merge_shards
 from levelproof.pipeline.store.publish import publishing
 from levelproof.pipeline.store.remote import is_remote
-from levelproof.pipeline.store.schema import Encoding
-from levelproof.pipeline.store.shard import Shard, damaged
+from levelproof.pipeline.store.shard import Shard, damaged, read_together, write_shard
 
 ROWS = 100_000  # of a sealed fragment, about; more: fewer files, but more to rewrite when levels are added
+CONVERTED = 256  # levels in memory at a time when their density changes; 300 MB of size l
 CROWD = 1_000  # unsealed neighbours that are merged even if they have fewer rows: many small files are slow to read
 
 
@@ -241,6 +242,34 @@ def _converted(
             found += some
             converted(len(some))
     return {wanted: sorted(found, key=lambda place: place.level_id)} if wanted else {}
+
+
+def convert(
+    places: Sequence[Place], density: Density, key_every: int, another: Callable[[], Path]
+) -> Iterator[list[Place]]:
+    """Write trajectories in another density, at most CONVERTED to a new shard, durably.
+
+    Args:
+        places: of the trajectories, which have one size and one set of rules.
+        density: of the new shards.
+        key_every: env steps between key frames of `witness`.
+        another: returns the path of the next new shard.
+
+    Yields:
+        The new places, shard after shard.
+
+    Raises:
+        Failure: a shard is damaged, or the engine on this machine computes states that differ from the stored ones.
+        OSError: the write fails.
+    """
+    for first in range(0, len(places), CONVERTED):
+        some = places[first : first + CONVERTED]
+        by_shard = groupby(some, lambda place: place.shard)
+        parts = [(Shard(path), [place.row for place in group]) for path, group in by_shard]
+        arrays = {name: np.moveaxis(x, 0, -1) for name, x in read_together(parts, exactly=True).items()}
+        encoding, path = replace(parts[0][0].encoding, density=density, key_every=key_every), another()
+        write_shard(path, [place.level_id for place in some], arrays, encoding)
+        yield [Place(path, row, place.level_id) for row, place in enumerate(some)]
 
 
 def _another(split: Path, unit: str, between: list[Path]) -> Path:

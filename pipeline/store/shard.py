@@ -34,10 +34,10 @@ from levelproof.pipeline.store.contents import (
 from levelproof.pipeline.store.density import Restored, kept, needed, restored
 from levelproof.pipeline.store.disk import flush
 from levelproof.pipeline.store.fields import same_bits
+from levelproof.pipeline.store.formats import FLAT, SHARD_VERSION, Encoding, FieldSpec, field_table
 from levelproof.pipeline.store.layout import data_path
 from levelproof.pipeline.store.packing import empty, pack, unpack
 from levelproof.pipeline.store.remote import at_once, is_remote, mended, stored_in
-from levelproof.pipeline.store.schema import FLAT, SHARD_VERSION, Encoding, FieldSpec, field_table
 
 FORMAT = "levelproof.shard"
 # What reading untrusted bytes can raise
@@ -56,7 +56,7 @@ class EngineDiffers(UserWarning):
 def write_shard(
     path: Path, level_ids: Sequence[int], arrays: Mapping[str, np.ndarray], encoding: Encoding = FULL
 ) -> None:
-    """Write `arrays` (every field, level axis last, see `pipeline.store.schema`) to a new group at `path`, durably.
+    """Write `arrays` (every field, level axis last, see `pipeline.store.formats`) to a new group at `path`, durably.
 
     Raises:
         FileExistsError: `path` exists.

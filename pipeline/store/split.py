@@ -8,11 +8,11 @@ from pathlib import Path
 
 from levelproof.configs.schema import REMOVED, JobConfig
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.store.disk import told_of, write_new
+from levelproof.pipeline.store.disk import explaining_writes, write_new
 from levelproof.pipeline.store.layout import EVENTS, FOLDERS, JOB, split_path
 from levelproof.pipeline.store.leftovers import clean
 from levelproof.pipeline.store.locks import committing, only_writer
-from levelproof.pipeline.store.manifest import Manifest, differences, told
+from levelproof.pipeline.store.manifest import Manifest, changes_text, differences
 from levelproof.pipeline.store.objects import require_conditions
 from levelproof.pipeline.store.remote import is_remote
 from levelproof.pipeline.urls import require_known
@@ -38,7 +38,7 @@ def writing(job: JobConfig, say: Callable[[str], None], split: Path | None = Non
             changes = differences(manifest.config or {}, job.results)
             same = "the version of levelproof that made it" if changes.keys() & REMOVED else "the same settings"
             raise UserError(
-                f"The split {split} was made with another configuration ({told(changes)}): "
+                f"The split {split} was made with another configuration ({changes_text(changes)}): "
                 f"use {same}, or another folder with out=NAME."
             )
         stored = {density for fragment in manifest.fragments for density in fragment.densities}
@@ -78,7 +78,7 @@ def locked(split: Path, say: Callable[[str], None]) -> Iterator[None]:
         return
     _make_writable(split)
     _require_own_folders(split)
-    with told_of(split), only_writer(split, say):
+    with explaining_writes(split), only_writer(split, say):
         with committing(split):
             pass  # take the workers' lock once, to fail before anything trains if the file system has no locks
         yield

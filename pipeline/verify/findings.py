@@ -7,7 +7,7 @@ from typing import Any
 
 from levelproof.pipeline.store.origins import Origin
 from levelproof.pipeline.store.remote import as_typed
-from levelproof.pipeline.store.runs import runs, told_levels
+from levelproof.pipeline.store.runs import runs, runs_text
 from levelproof.pipeline.words import many
 
 
@@ -64,4 +64,4 @@ class Findings:
 
 
 def _levels(level_ids: Iterable[int]) -> str:
-    return f"affects {told_levels(runs(sorted(level_ids)))}"
+    return f"affects {runs_text(runs(sorted(level_ids)))}"

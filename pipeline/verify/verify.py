@@ -49,15 +49,15 @@ from levelproof.pipeline.store.layout import (
 from levelproof.pipeline.store.locks import is_written
 from levelproof.pipeline.store.manifest import (
     Fragment,
+    changes_text,
     differences,
     fragment_paths,
     read_fragment,
     require_manifest,
-    told,
 )
 from levelproof.pipeline.store.origins import origin_of
 from levelproof.pipeline.store.remote import is_remote
-from levelproof.pipeline.store.runs import runs, told_levels, without
+from levelproof.pipeline.store.runs import runs, runs_text, without
 from levelproof.pipeline.store.shard import Shard, open_shard
 from levelproof.pipeline.verify.evidence import COLUMNS, Evidence, Recipe, same_stack
 from levelproof.pipeline.verify.findings import Findings
@@ -129,7 +129,7 @@ def _examine_once(split: Path, console: Console | None) -> Findings:
         missing = without(without(note.level_ids.tolist(), present), np.array(sorted(findings.lost), np.int64))
         if missing:
             findings.missing = missing
-            findings.wrong[f"The last command requested {told_levels(missing)}, but no fragment has them."] = set()
+            findings.wrong[f"The last command requested {runs_text(missing)}, but no fragment has them."] = set()
     return findings
 
 
@@ -198,7 +198,8 @@ def _require_one_configuration(split: Path, parts: Sequence[Part], config: dict[
         if changes := differences(config, fragment.config):
             raise Failure(
                 f"The split {split} mixes two configurations, the one of {fragment.path.name} and an earlier one "
-                f"({told(changes)}): move the fragments of one of them elsewhere, with their shards and experts."
+                f"({changes_text(changes)}): move the fragments of one of them elsewhere, with their shards and "
+                "experts."
             )
 
 

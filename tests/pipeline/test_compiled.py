@@ -4,7 +4,7 @@ import os
 import time
 from pathlib import Path
 
-from levelproof.pipeline.compiled import LAST_CHECK, remove_damaged
+from levelproof.pipeline.runtime import LAST_CHECK, remove_damaged
 from tests.pipeline.test_runtime import python
 
 COMPILE = """

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from levelproof.experts.labels import Label
-from levelproof.pipeline.store.events import new_run, tell
+from levelproof.pipeline.store.event_files import new_run, write_events
 from levelproof.pipeline.store.locks import only_writer
 from tests.pace import patience
 from tests.pipeline.command import COMMAND_SECONDS, ROOT
@@ -72,7 +72,7 @@ def test_watch_ends_when_its_reader_leaves(split: Path, unread: int) -> None:
     """It ends although the run that it watches continues."""
     workers = {"a machine": {"count": 2, "silent": 1.5}}
     numbers = dict.fromkeys(("levels", "done", "solved", "env_steps", "rate", "left", "failures", "quarantined"), 1)
-    tell(new_run(split), [{"time": time.time(), "event": "progress", "workers": workers, **numbers}])
+    write_events(new_run(split), [{"time": time.time(), "event": "progress", "workers": workers, **numbers}])
     with only_writer(split, print):
         done = levelproof("status", str(split), "--watch", "--json", stdout=unread)
     assert (done.returncode, done.stderr) == (0, "")

@@ -22,17 +22,17 @@ from levelproof.levelgen.level import Level
 from levelproof.levelgen.pictures.palette import palette_css
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.look import cost
-from levelproof.pipeline.look.gallery.columns import NOTHING, PAGE, encode_columns, encode_page
+from levelproof.pipeline.look.entities import ENTITIES, count_entities
+from levelproof.pipeline.look.gallery.pages import NOTHING, PAGE, encode_columns, encode_page
 from levelproof.pipeline.look.gallery.worlds import drawn_bodies, encode_array, states_of, world_of
 from levelproof.pipeline.look.spread import spread
-from levelproof.pipeline.look.things import ENTITIES, count_entities
 from levelproof.pipeline.read.levels import levels_of, rules_of
 from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.store.bar import with_bar
 from levelproof.pipeline.store.created import new_folder
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 from levelproof.pipeline.store.remote import as_typed
-from levelproof.pipeline.store.shown import shown
 from levelproof.pipeline.words import many
 
 SITE = Path(__file__).parent / "site"
@@ -56,7 +56,7 @@ def gallery(split: Path, out: Path, where: str | None, most: int) -> None:
     with new_folder(out, replaces=lambda folder: (folder / ABOUT).is_file()) as folder:
         shutil.copytree(SITE, folder, dirs_exist_ok=True)
         (folder / "palette.css").write_text(palette_css(), encoding="utf-8")
-        counted = [_write_block(folder, manifest, first) for first in shown(range(0, count, BLOCK), "levels")]
+        counted = [_write_block(folder, manifest, first) for first in with_bar(range(0, count, BLOCK), "levels")]
         entities = {name: np.concatenate([counts[name] for counts in counted]) for name in ENTITIES}
         about, values = encode_columns(manifest.table, entities | {"seconds": cost.seconds_of(manifest.table)})
         for page in range(math.ceil(count / PAGE)):

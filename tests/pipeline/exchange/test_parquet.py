@@ -12,9 +12,9 @@ import levelproof
 from levelproof.pipeline.cli.main import main
 from levelproof.pipeline.exchange import parquet
 from levelproof.pipeline.store.columns import COLUMNS
+from levelproof.pipeline.store.formats import CONFIG_KEY
 from levelproof.pipeline.store.layout import MANIFEST
 from levelproof.pipeline.store.manifest import read_manifest
-from levelproof.pipeline.store.schema import CONFIG_KEY
 from tests.pipeline.made import PLAYED, made_job
 
 pytestmark = pytest.mark.slow

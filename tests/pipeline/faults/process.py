@@ -27,7 +27,7 @@ import numpy as np
 from levelproof.configs import compose
 from levelproof.pipeline.cli.main import main
 from levelproof.pipeline.jobs import inline, unit
-from levelproof.pipeline.store import density, events, leases, remote, seal, shard
+from levelproof.pipeline.store import density, event_files, leases, remote, seal, shard
 from tests.pace import patience
 from tests.pipeline.faults import crew
 from tests.pipeline.faults.effects import Effects, Tell
@@ -228,7 +228,7 @@ def _set_clock_back() -> None:
             return datetime.now(tz) - timedelta(seconds=DAY)
 
     time.time = lambda: now() - DAY
-    events.datetime = Earlier  # type: ignore[misc]
+    event_files.datetime = Earlier  # type: ignore[misc]
 
 
 def set_up() -> None:
@@ -240,7 +240,6 @@ def set_up() -> None:
         "levelproof.pipeline.jobs.generate",
         "levelproof.pipeline.jobs.regenerate",
         "levelproof.pipeline.jobs.seal",
-        "levelproof.pipeline.jobs.level_files",
     ):
         import_module(name)
     import_module("obstore.store")

@@ -52,12 +52,12 @@ from levelproof.pipeline.store import bounds, hub, remote
 from levelproof.pipeline.store.checkpoints import load_experts, save_experts
 from levelproof.pipeline.store.contents import check_numbers, table_for
 from levelproof.pipeline.store.fields import arrays_of
+from levelproof.pipeline.store.formats import CONFIG_KEY, HASH_KEY, Encoding
 from levelproof.pipeline.store.job_note import NoteError, note_job, read_note
 from levelproof.pipeline.store.layout import BEGUN, DATA, FRAGMENT, JOB, MANIFEST, entries
-from levelproof.pipeline.store.manifest import differences, fragment_paths, read_fragment, read_manifest, told
+from levelproof.pipeline.store.manifest import changes_text, differences, fragment_paths, read_fragment, read_manifest
 from levelproof.pipeline.store.origins import place_of
 from levelproof.pipeline.store.pieces import PieceCache
-from levelproof.pipeline.store.schema import CONFIG_KEY, HASH_KEY, Encoding
 from levelproof.pipeline.store.shard import Shard, write_shard
 from tests.pipeline.hostile.mutations import (
     mutate_bytes,
@@ -272,7 +272,7 @@ def fragments(folder: Path) -> Target:
                 return
             fragment, rows = read_fragment(path, None, np.array([1]) if random.random() < 0.3 else None)
             rows.to_pylist()
-            told(differences(fragment.config, {}))
+            changes_text(differences(fragment.config, {}))
             found = read_manifest(split, ["label", "shard", "experts"], compact=random.random() < 0.5)
             found.counts(np.ones(len(found.level_ids), bool))
             assert set(found.labels) <= {*Label}

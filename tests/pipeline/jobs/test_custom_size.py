@@ -8,7 +8,7 @@ from PIL import Image
 
 from levelproof.pipeline.exchange.level_json import export
 from levelproof.pipeline.look.inspect import inspect, survey
-from levelproof.pipeline.look.rows import RowQuery
+from levelproof.pipeline.look.query import RowQuery
 from levelproof.pipeline.look.show import show
 from levelproof.pipeline.look.status import read_status
 from levelproof.pipeline.store.columns import OF_THE_RUN

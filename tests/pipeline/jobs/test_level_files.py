@@ -20,7 +20,7 @@ from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.jobs.schedule import WorkUnit, plan_units
 from levelproof.pipeline.jobs.unit import failure
 from levelproof.pipeline.look.inspect import survey
-from levelproof.pipeline.look.rows import RowQuery
+from levelproof.pipeline.look.query import RowQuery
 from levelproof.pipeline.look.status import read_status
 from levelproof.pipeline.read.level_files import LevelUnavailable, level_at, levels_below
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from levelproof.pipeline.stopping import LAST
-from levelproof.pipeline.store.events import events_of, runs_in
+from levelproof.pipeline.store.event_files import events_of, runs_in
 from levelproof.pipeline.store.fields import same_bits
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.shard import Shard

@@ -20,7 +20,7 @@ from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import commit
 from levelproof.pipeline.look.duplicates import between, comparison_of_source, describe, hash_strings, within
 from levelproof.pipeline.look.inspect import survey
-from levelproof.pipeline.look.rows import RowQuery
+from levelproof.pipeline.look.query import RowQuery
 from levelproof.pipeline.store.layout import split_path
 from levelproof.pipeline.store.manifest import require_manifest
 from tests.levelgen.opened import handmade_levels

@@ -12,12 +12,12 @@ import pytest
 from levelproof.experts.witness.witness import steps_to_goal
 from levelproof.pipeline.cli.gallery import MAX_LEVELS
 from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.look.entities import count_entities
 from levelproof.pipeline.look.gallery import gallery as module
-from levelproof.pipeline.look.gallery.columns import FLAGS, NOTHING, NUMBERS
 from levelproof.pipeline.look.gallery.gallery import BLOCK, gallery
+from levelproof.pipeline.look.gallery.pages import FLAGS, NOTHING, NUMBERS
 from levelproof.pipeline.look.gallery.worlds import ANGLE, LENGTH, angles
 from levelproof.pipeline.look.reasons import kind_of_reason
-from levelproof.pipeline.look.things import count_entities
 from levelproof.pipeline.read.levels import levels_of
 from levelproof.pipeline.read.rows import read_row
 from levelproof.pipeline.store.manifest import Manifest, require_manifest

@@ -20,15 +20,13 @@ from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import commit
-from levelproof.pipeline.look import rows as rows_module
-from levelproof.pipeline.look import shares
+from levelproof.pipeline.look import entities, query
+from levelproof.pipeline.look.entities import count_entities, solved_by_entities
 from levelproof.pipeline.look.facts import print_facts
 from levelproof.pipeline.look.inspect import inspect, survey
 from levelproof.pipeline.look.plot import plot
+from levelproof.pipeline.look.query import SHOWN, RowQuery, write_csv
 from levelproof.pipeline.look.reasons import kind_of_reason
-from levelproof.pipeline.look.rows import SHOWN, RowQuery, write_csv
-from levelproof.pipeline.look.shares import solved_by_entities
-from levelproof.pipeline.look.things import count_entities
 from levelproof.pipeline.read import levels as levels_module
 from levelproof.pipeline.read.select import columns_in
 from levelproof.pipeline.store import manifest
@@ -118,7 +116,7 @@ def test_survey_sorts_and_limits_rows(split: Path) -> None:
 
 def test_write_csv_writes_all_rows(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Block by block; lists and structs are JSON."""
-    monkeypatch.setattr(rows_module, "BLOCK", 5)
+    monkeypatch.setattr(query, "BLOCK", 5)
     write_csv(split, RowQuery("label != 'trivial'", sort="level_id DESC"), text := io.StringIO())
     read = list(csv.DictReader(text.getvalue().splitlines()))
     assert [int(row["level_id"]) for row in read] == [11, 10, 8, 7, 6, 4, 3, 2, 0]
@@ -145,7 +143,7 @@ def test_survey_counts_reasons_witnesses_and_steps(split: Path) -> None:
 def test_solved_by_entities_resamples_levels_from_ids(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No shard is read."""
     monkeypatch.setattr(levels_module, "read_rows", None)
-    monkeypatch.setattr(shares, "SAMPLED", 8)
+    monkeypatch.setattr(entities, "SAMPLED", 8)
     found = solved_by_entities(read_manifest(split, ["label"]), np.arange(12))
     assert (found["looked_at"], found["of"], found["levels"]) == (8, 12, 4)
     levels = sample_levels(np.arange(12), SIZES["s"])
@@ -160,7 +158,7 @@ def test_inspect_reports_the_rest_without_a_level_file(
     def missing(*_: object) -> None:
         raise Failure("the file is missing")
 
-    monkeypatch.setattr(shares, "levels_of", missing)
+    monkeypatch.setattr(entities, "levels_of", missing)
     inspect(split, RowQuery(limit=0), as_json=False)
     assert "solved, by entities:             the file is missing\n" in capsys.readouterr().out
 

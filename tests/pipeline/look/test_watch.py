@@ -10,7 +10,7 @@ from rich.console import Console
 
 from levelproof.experts.labels import Label
 from levelproof.pipeline.look.watch import progress_table, read_progress, watch
-from levelproof.pipeline.store.events import new_run, tell
+from levelproof.pipeline.store.event_files import new_run, write_events
 from levelproof.pipeline.store.locks import only_writer
 from tests.pace import patience
 from tests.pipeline.command import assert_refused, here
@@ -32,8 +32,8 @@ def state(event: str, age: float = 0.0, **changes: object) -> dict:
 def test_watch_prints_a_line_per_refresh_until_the_run_ends(split: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = new_run(split)
     failed = {"time": time.time(), "event": "failed", "unit": "0-1", "cause": "of this one"}
-    tell(run, [failed, state("progress")])
-    timer = threading.Timer(patience(0.5), lambda: tell(run, [failed, state("ended", done=8)]))
+    write_events(run, [failed, state("progress")])
+    timer = threading.Timer(patience(0.5), lambda: write_events(run, [failed, state("ended", done=8)]))
     with only_writer(split, print):
         timer.start()
         watch(split, True, Console(), interval=0.1)
@@ -45,7 +45,7 @@ def test_watch_prints_a_line_per_refresh_until_the_run_ends(split: Path, capsys:
 
 
 def test_watch_tells_dead_runs_from_silent_ones(split: Path) -> None:
-    tell(new_run(split), [state("progress", age=600.0)])
+    write_events(new_run(split), [state("progress", age=600.0)])
     assert not read_progress(split)["running"]
     with only_writer(split, print):
         facts = read_progress(split)
@@ -62,7 +62,7 @@ def test_watch_tells_dead_runs_from_silent_ones(split: Path) -> None:
 def test_watch_prints_causes_without_control_characters(split: Path) -> None:
     failed = {"time": 1.0, "event": "failed", "unit": "0-1", "cause": "KeyError: [b] of [/a]\x1b[2J"}
     damaged = {"time": 1.0, "event": "failed"}
-    tell(new_run(split), [failed, damaged, state("ended")])
+    write_events(new_run(split), [failed, damaged, state("ended")])
     done = here(["status", str(split), "--watch"], split)
     assert done.returncode == 0, done.stderr
     assert "0-1: KeyError: [b] of [/a]?[2J" in done.stdout
@@ -70,5 +70,5 @@ def test_watch_prints_causes_without_control_characters(split: Path) -> None:
 
 def test_watch_refuses_a_split_without_events(split: Path) -> None:
     assert_refused(here(["status", str(split), "--watch"], split), 2, "No run has logged its state")
-    tell(new_run(split), [{"time": 1.0, "event": "progress"}])  # damaged
+    write_events(new_run(split), [{"time": 1.0, "event": "progress"}])  # damaged
     assert_refused(here(["status", str(split), "--watch"], split), 2, "No run has logged its state")

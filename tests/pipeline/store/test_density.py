@@ -33,7 +33,7 @@ from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import commit
 from levelproof.pipeline.read.rows import read_rows
-from levelproof.pipeline.store import convert, density, seal
+from levelproof.pipeline.store import density, seal
 from levelproof.pipeline.store.contents import blank_row, table_for
 from levelproof.pipeline.store.density import CHECKSUM, key_rows, task_states
 from levelproof.pipeline.store.fields import arrays_of, same_bits, tree_of
@@ -41,7 +41,7 @@ from levelproof.pipeline.store.layout import split_path
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.merge import Place
 from levelproof.pipeline.store.packing import pack, unpack
-from levelproof.pipeline.store.schema import Encoding, field_table
+from levelproof.pipeline.store.formats import Encoding, field_table
 from levelproof.pipeline.store.shard import EngineDiffers, Shard, read_together, stored_bytes, write_shard
 from levelproof.pipeline.store.split import writing
 from tests.pipeline.made import made_fields, made_job, made_verdict
@@ -381,11 +381,11 @@ def test_state_fields_match_those_of_records() -> None:
 
 def test_convert_writes_a_few_levels_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In the order of places, from any densities."""
-    monkeypatch.setattr(convert, "LEVELS", 2)
+    monkeypatch.setattr(seal, "CONVERTED", 2)
     witness, full = write(tmp_path, WITNESS), write(tmp_path, Encoding())
     places = [Place(shard.path, row, IDS[row]) for shard, row in ((full, 0), (witness, 1), (witness, 2))]
     paths = iter(tmp_path / f"{i}.zarr" for i in range(9))
-    found = list(convert.convert(places, "resume", 32, lambda: next(paths)))
+    found = list(seal.convert(places, "resume", 32, lambda: next(paths)))
     assert [[place.level_id for place in group] for group in found] == [IDS[:2], IDS[2:3]]
     for place in (place for group in found for place in group):
         shard = Shard(place.shard)
@@ -399,7 +399,7 @@ def test_convert_refuses_differing_states(tmp_path: Path, keyed: tuple[int, int]
     level, row = keyed
     shard = changed(write(tmp_path, WITNESS), lambda stored: ulp(stored, "key/state/position", 0, level))
     with pytest.raises(Failure, match=f"states that differ from the stored ones for 1 of 1 .* {row} on: read"):
-        list(convert.convert([Place(shard.path, level, IDS[level])], "full", 32, lambda: tmp_path / "new.zarr"))
+        list(seal.convert([Place(shard.path, level, IDS[level])], "full", 32, lambda: tmp_path / "new.zarr"))
     assert not (tmp_path / "new.zarr").exists()
 
 
@@ -452,7 +452,7 @@ def test_failed_conversion_changes_nothing(split: Path, monkeypatch: pytest.Monk
     def fail(*_: Any, **__: Any) -> None:
         raise OSError(errno.ENOSPC, "full")
 
-    monkeypatch.setattr(convert if step == "write_shard" else seal, step, fail)
+    monkeypatch.setattr(seal, step, fail)
     assert levelproof("seal", split, "--density", "resume") == 1
     assert_whole(split, "full")
 

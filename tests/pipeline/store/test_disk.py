@@ -24,7 +24,7 @@ from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import failure
 from levelproof.pipeline.store.checkpoints import save_experts
-from levelproof.pipeline.store.disk import flush_entry, told_of
+from levelproof.pipeline.store.disk import explaining_writes, flush_entry
 from levelproof.pipeline.store.fields import arrays_of
 from levelproof.pipeline.store.layout import WRITER_LOCK, new_attempt, unit_name
 from levelproof.pipeline.store.locks import only_writer
@@ -60,18 +60,21 @@ def kept_experts() -> dict[int, KeptExpert]:
 
 
 @pytest.mark.parametrize(("code", "words"), [(errno.ENOSPC, "the disk is full: free"), (errno.EIO, "the disk fails")])
-def test_told_of_explains_failed_writes(tmp_path: Path, code: int, words: str) -> None:
-    with pytest.raises(Failure, match=f"^Cannot write to {tmp_path}, {words}.* same command again"), told_of(tmp_path):
+def test_explaining_writes_turns_failed_writes_into_sentences(tmp_path: Path, code: int, words: str) -> None:
+    with (
+        pytest.raises(Failure, match=f"^Cannot write to {tmp_path}, {words}.* same command again"),
+        explaining_writes(tmp_path),
+    ):
         raise OSError(code, "refused")
-    with pytest.raises(FileNotFoundError), told_of(tmp_path):
+    with pytest.raises(FileNotFoundError), explaining_writes(tmp_path):
         (tmp_path / "gone").read_bytes()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs a file that even root cannot write to")
-def test_told_of_names_the_file_that_cannot_be_written(tmp_path: Path) -> None:
+def test_explaining_writes_names_the_file_that_cannot_be_written(tmp_path: Path) -> None:
     elsewhere = Path("/proc/sys/kernel/version")
     words = f"^Cannot write to {elsewhere}, writing is not permitted.* same command again"
-    with pytest.raises(Failure, match=words), told_of(tmp_path):
+    with pytest.raises(Failure, match=words), explaining_writes(tmp_path):
         elsewhere.write_bytes(b"")
     with pytest.raises(OSError, match="version") as refused:
         elsewhere.write_bytes(b"")

@@ -14,18 +14,18 @@ from levelproof.configs.schema import JobConfig
 from levelproof.experts.labels import Label
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs.unit import manifest_row
+from levelproof.pipeline.store import bar
 from levelproof.pipeline.store import manifest as manifest_file
-from levelproof.pipeline.store import shown
 from levelproof.pipeline.store.columns import COLUMNS
 from levelproof.pipeline.store.layout import new_attempt, unit_name
 from levelproof.pipeline.store.manifest import (
     begin_fragment,
+    changes_text,
     differences,
     fragment_paths,
     read_fragment,
     read_manifest,
     require_manifest,
-    told,
     write_fragment,
 )
 from tests.pipeline.made import made_job, made_verdict
@@ -71,7 +71,7 @@ def test_read_manifest_shows_a_bar_for_many_fragments(
 ) -> None:
     seen = io.StringIO()
     monkeypatch.setattr(manifest_file, "MANY", 2)
-    monkeypatch.setattr(shown, "Console", lambda stderr: Console(file=seen, force_terminal=terminal))
+    monkeypatch.setattr(bar, "Console", lambda stderr: Console(file=seen, force_terminal=terminal))
     commit(tmp_path, job, [0])
     assert read_manifest(tmp_path).level_ids.tolist() == [0]
     assert not seen.getvalue()
@@ -191,7 +191,7 @@ def test_read_manifest_refuses_two_configurations(tmp_path: Path, job: JobConfig
 def test_differences_name_old_and_new() -> None:
     changes = differences({"a": {"b": 1, "gone": 2}, "same": 0}, {"a": {"b": 3}, "same": 0, "new": 4})
     assert changes == {"a.b": (1, 3), "a.gone": (2, "absent"), "new": ("absent", 4)}
-    assert told({f"s{i}": (i, -i) for i in range(8)}).endswith("s5 was 5, now -5 and 2 more")
+    assert changes_text({f"s{i}": (i, -i) for i in range(8)}).endswith("s5 was 5, now -5 and 2 more")
 
 
 def test_unit_names_sort_as_ids() -> None:

@@ -20,7 +20,7 @@ import pytest
 from levelproof.pipeline.errors import Failure, StoreFailure, UserError
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.store import leases, machine, remote
-from levelproof.pipeline.store.events import KEPT, events_of, new_run, runs_in, tell
+from levelproof.pipeline.store.event_files import KEPT, events_of, new_run, runs_in, write_events
 from levelproof.pipeline.store.layout import FRAGMENT, WRITER_LOCK, data_paths, new_attempt, unit_name
 from levelproof.pipeline.store.leases import Lease, LeaseLost
 from levelproof.pipeline.store.leftovers import clean
@@ -569,5 +569,5 @@ def test_generate_writes_the_same_to_a_store_and_a_folder(server: Server, tmp_pa
 
 def test_new_run_removes_the_oldest_events_in_a_store(server: Server) -> None:
     for number in range(KEPT + 1):
-        tell(new_run(THERE), [{"time": float(number), "event": "started"}])
+        write_events(new_run(THERE), [{"time": float(number), "event": "started"}])
     assert sorted(event["time"] for run in runs_in(THERE) for event in events_of(run)) == list(range(1, KEPT + 1))

@@ -26,8 +26,8 @@ import levelproof
 from levelproof.experts.labels import Label
 from levelproof.pipeline.errors import Failure, LevelproofError, StoreFailure, UserError
 from levelproof.pipeline.read.rows import read_rows
-from levelproof.pipeline.store import events, hub, job_note, leases, remote
-from levelproof.pipeline.store.events import events_of
+from levelproof.pipeline.store import event_files, hub, job_note, leases, remote
+from levelproof.pipeline.store.event_files import events_of
 from levelproof.pipeline.store.fields import same_bits
 from levelproof.pipeline.store.job_note import NoteError, note_job, read_note
 from levelproof.pipeline.store.layout import WRITER_LOCK
@@ -320,7 +320,7 @@ def test_read_stops_at_the_maximum_size(tmp_path: Path, monkeypatch: pytest.Monk
         assert read_note(there).intact
         assert is_leased(there, print)
         assert len(events_of(there / "run.jsonl")) == 1
-        for module in (job_note, leases, events):
+        for module in (job_note, leases, event_files):
             monkeypatch.setattr(module, "MAX_BYTES", 20)
         with pytest.raises(NoteError, match="OSError"):
             read_note(there)

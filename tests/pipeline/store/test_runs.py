@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from levelproof.pipeline.store.runs import inside, runs, told_levels, without
+from levelproof.pipeline.store.runs import inside, runs, runs_text, without
 
 
 def test_runs_groups_consecutive_numbers() -> None:
@@ -36,7 +36,7 @@ def test_without_is_fast_for_a_long_run() -> None:
     assert without([(0, 10**15)], np.array([5, 6, 10**15])) == [(0, 4), (7, 10**15 - 1)]
 
 
-def test_told_levels_describes_runs() -> None:
-    assert told_levels([(7, 7)]) == "level 7"
-    assert told_levels([(2, 5), (9, 9)]) == "levels 2 to 5, 9"
-    assert told_levels([(i, i) for i in range(0, 12, 2)]) == "levels 0, 2, 4, 6 and 2 more runs of levels"
+def test_runs_text_describes_runs() -> None:
+    assert runs_text([(7, 7)]) == "level 7"
+    assert runs_text([(2, 5), (9, 9)]) == "levels 2 to 5, 9"
+    assert runs_text([(i, i) for i in range(0, 12, 2)]) == "levels 0, 2, 4, 6 and 2 more runs of levels"

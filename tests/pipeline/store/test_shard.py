@@ -14,7 +14,7 @@ from levelproof.levelgen.level import SIZES, Level
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.fields import arrays_of, same_bits, tree_of
 from levelproof.pipeline.store.packing import pack, unpack
-from levelproof.pipeline.store.schema import ALONG_TIME, field_table
+from levelproof.pipeline.store.formats import ALONG_TIME, field_table
 from levelproof.pipeline.store.shard import Shard, stored_bytes, write_shard
 from tests.pipeline.made import made_fields, made_level, made_record
 

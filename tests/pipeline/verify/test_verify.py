@@ -19,10 +19,10 @@ from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
 from levelproof.pipeline.errors import StoreFailure
 from levelproof.pipeline.store import remote
 from levelproof.pipeline.store.checksums import digests_of, with_own
+from levelproof.pipeline.store.formats import DIGESTS_KEY
 from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.layout import MANIFEST, unit_name
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, write_index
-from levelproof.pipeline.store.schema import DIGESTS_KEY
 from levelproof.pipeline.store.shard import Shard, write_shard
 from levelproof.pipeline.verify import evidence
 from levelproof.pipeline.verify.verify import examine

@@ -7,17 +7,29 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from jaxtyping import Int
 
 from levelproof.configs.schema import from_files
 from levelproof.experts.labels import TRAINED, Label
+from levelproof.levelgen.level import Level
+from levelproof.physics.types import FIXED_POLYGONS
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.look.figures import Share
-from levelproof.pipeline.look.things import count_entities
 from levelproof.pipeline.read.levels import COLUMNS, levels_of
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 
+ENTITIES = ("bodies", "joints", "motors", "thrusters")
 SAMPLED, READ = 4096, 256  # maximum sample: levels resampled from their ids, levels read
 MANY = 1_000_000  # levels; above, nothing is sampled
+
+
+def count_entities(level: Level) -> dict[str, Int[np.ndarray, " level"]]:
+    """Count each level's bodies (without scenery), joints (fixed ones too), motors that are on, and thrusters."""
+    model = level.model
+    joints, motors = np.asarray(model.joint_active), np.asarray(model.motor_on) & ~np.asarray(model.joint_fixed)
+    bodies, thrusters = np.asarray(model.active)[FIXED_POLYGONS:], np.asarray(model.thruster_active)
+    counts = (x.sum(0, dtype=np.int32) for x in (bodies, joints, joints & motors, thrusters))
+    return dict(zip(ENTITIES, counts, strict=True))
 
 
 def solved_by_entities(manifest: Manifest, ids: np.ndarray) -> dict[str, Any]:

@@ -9,16 +9,16 @@ from rich.progress import track
 T = TypeVar("T")
 
 
-def shown(parts: Iterable[T], words: str, count: int | None = None, least: int = 0) -> Iterable[T]:
+def with_bar(parts: Iterable[T], label: str, count: int | None = None, minimum: int = 0) -> Iterable[T]:
     """Iterate over `parts`, with a progress bar on a terminal.
 
     Args:
         parts: items.
-        words: label of the bar.
+        label: of the bar.
         count: number of items, if `parts` has no length.
-        least: minimum of `count` for which a bar is shown.
+        minimum: of `count`, for which a bar is shown.
     """
-    if count is not None and count < least:
+    if count is not None and count < minimum:
         return parts
     console = Console(stderr=True)
-    return track(parts, words, count, console=console, transient=True, disable=not console.is_terminal)
+    return track(parts, label, count, console=console, transient=True, disable=not console.is_terminal)

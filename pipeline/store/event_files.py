@@ -46,7 +46,7 @@ def runs_in(split: Path) -> list[Path]:
     return sorted(entries(split, EVENTS, RUN, DirEntry.is_file))
 
 
-def tell(path: Path, events: Sequence[Event]) -> None:
+def write_events(path: Path, events: Sequence[Event]) -> None:
     """Replace a run's file as a whole. A failed write does not end the run."""
     with suppress(OSError, LevelproofError):
         write(path, "".join(json.dumps(event) + "\n" for event in events).encode())

@@ -5,23 +5,23 @@ from pathlib import Path
 import pytest
 
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.store.events import KEPT, events_of, new_run, runs_in, tell
+from levelproof.pipeline.store.event_files import KEPT, events_of, new_run, runs_in, write_events
 from levelproof.pipeline.store.layout import EVENTS
 from levelproof.pipeline.store.split import locked
 
 
-def test_tell_replaces_a_runs_file_and_new_run_removes_old_ones(tmp_path: Path) -> None:
+def test_write_events_replaces_a_runs_file_and_new_run_removes_old_ones(tmp_path: Path) -> None:
     (tmp_path / EVENTS).mkdir()
     foreign = tmp_path / EVENTS / "mine.txt"
     foreign.touch()
     for path in (new_run(tmp_path) for _ in range(KEPT + 4)):
-        tell(path, [])
+        write_events(path, [])
     path = new_run(tmp_path)
-    tell(path, [{"time": 1.0, "event": "started"}])
-    tell(path, [{"time": 1.0, "event": "started"}, {"time": 2.0, "event": "ended"}])
+    write_events(path, [{"time": 1.0, "event": "started"}])
+    write_events(path, [{"time": 1.0, "event": "started"}, {"time": 2.0, "event": "ended"}])
     (tmp_path / EVENTS / f".{path.name}.123").touch()  # of a dead run
     last = new_run(tmp_path)
-    tell(last, [])
+    write_events(last, [])
     assert [event["event"] for event in events_of(path)] == ["started", "ended"]
     assert len(runs_in(tmp_path)) == KEPT
     assert {entry.name for entry in (tmp_path / EVENTS).iterdir()} == {
@@ -30,8 +30,8 @@ def test_tell_replaces_a_runs_file_and_new_run_removes_old_ones(tmp_path: Path) 
     }
 
 
-def test_tell_ignores_failed_writes(tmp_path: Path) -> None:
-    tell(tmp_path / "gone" / "run.jsonl", [{"time": 1.0, "event": "started"}])
+def test_write_events_ignores_failed_writes(tmp_path: Path) -> None:
+    write_events(tmp_path / "gone" / "run.jsonl", [{"time": 1.0, "event": "started"}])
 
 
 def test_events_of_skips_invalid_lines(tmp_path: Path) -> None:
