@@ -2,7 +2,7 @@
 
 import dataclasses
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
@@ -28,7 +28,7 @@ from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import commit
 from levelproof.pipeline.store.columns import OF_THE_RUN
 from levelproof.pipeline.store.contents import highest
-from levelproof.pipeline.store.fields import arrays_of, tree_of
+from levelproof.pipeline.store.fields import arrays_of, same_bits, tree_of
 from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.layout import split_path
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
@@ -77,6 +77,14 @@ def made_record(size: str = "s", count: int = 3, seed: int = 0) -> Record:
 def made_fields(size: str = "s", count: int = 3, seed: int = 0) -> dict[str, np.ndarray]:
     """Return a shard's fields of random levels and records."""
     return arrays_of(made_level(size, count, seed), "level/") | arrays_of(made_record(size, count, seed), "record/")
+
+
+def assert_same(found: Mapping[str, np.ndarray], expected: Mapping[str, np.ndarray]) -> None:
+    """Check that two sets of fields have the same names, types and bits."""
+    assert found.keys() == expected.keys()
+    for name, values in expected.items():
+        assert found[name].dtype == values.dtype
+        assert same_bits(found[name], values).all(), name
 
 
 def _possible(tree: T, size: str, path: str) -> T:

@@ -12,6 +12,7 @@ import time
 from base64 import b64decode, b64encode
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from datetime import timedelta
 from email.utils import formatdate
 from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -22,6 +23,7 @@ from urllib.parse import parse_qs, unquote, urlsplit
 
 import pytest
 
+from levelproof.pipeline.store import leases, remote
 from tests.pace import patience, wait_until
 
 HOST = "127.0.0.1"
@@ -125,6 +127,41 @@ def serving(answers: Answers) -> Iterator[Server]:
         yield server
     finally:
         server.close()
+
+
+@contextmanager
+def serving_bucket(
+    patch: pytest.MonkeyPatch, folder: Path, seconds: float, answers: Answers | None = None
+) -> Iterator[Server]:
+    """Serve an empty bucket to this process, which has short time-outs and no cached metadata.
+
+    Args:
+        patch: sets this process up.
+        folder: of the bucket and the cache.
+        seconds: limit for retries.
+        answers: of the server (default: those of `bucket_of`).
+    """
+    patch.setenv("LEVELPROOF_CACHE_DIR", str(folder / "cache"))
+    patch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=seconds))
+    patch.setitem(remote.RETRIES, "backoff", {"init_backoff": timedelta(milliseconds=5)})
+    (folder / "s3/bucket").mkdir(parents=True)
+    with serving(answers or bucket_of(folder / "s3")) as server:
+        for name in [name for name in os.environ if name.startswith("AWS_")]:
+            patch.delenv(name)
+        known = {"ACCESS_KEY_ID": "any", "SECRET_ACCESS_KEY": "any", "REGION": "us-east-1", "ENDPOINT_URL": server.url}
+        for name, value in known.items():
+            patch.setenv(f"AWS_{name}", value)
+        forget()
+        yield server
+    forget()
+
+
+def forget() -> None:
+    """Drop what this process knows of stores, as if it had just started."""
+    remote._known.clear()
+    remote._store.cache_clear()
+    remote._cache_in.cache_clear()
+    leases._served.clear()
 
 
 def files_of(folder: Path) -> Answers:

@@ -4,7 +4,6 @@ from functools import cache
 
 import jax
 import numpy as np
-import pytest
 
 from levelproof.experts.config import ExpertConfig
 from levelproof.experts.labels import Source
@@ -107,9 +106,3 @@ def test_run_polishes_witnesses() -> None:
         assert witness is not None
         assert (witness.steps, witness.source) == (shortest()[1], Source.SEARCH)
         np.testing.assert_array_equal(witness.action[: witness.steps], polished().success.action[i, : witness.steps])
-
-
-def test_search_config_rejects_invalid_settings() -> None:
-    for wrong in ({"polish": -1}, {"polish": 2**31}, {"steady": -1}):
-        with pytest.raises(ValueError, match=f"^{next(iter(wrong))} is"):
-            SearchConfig(**wrong)  # pyright: ignore[reportArgumentType]

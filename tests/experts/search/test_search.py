@@ -330,7 +330,8 @@ def test_shorten_removes_detours() -> None:
     [{"lanes": 30}, {"entries": 0}, {"growth": 1.0}, {"width": 0.0}, {"nearer": 1.5}, {"anew": -0.5},
      {"redrawn": (0.5, 2.0)}, {"redrawn": ()}, {"entries": 16_385}, {"env_steps": 2**31}, {"driven_weight": -1.0},
      {"first_rung": 0}, {"per_cell": -1}, {"bodies": -1}, {"trials": 2000}, {"steady": 2000}, {"width": 1e-46},
-     {"growth": 1.00000001}, {"lanes": 2**28}, {"patience": -1}, {"variations": 2**31}],
+     {"growth": 1.00000001}, {"lanes": 2**28}, {"patience": -1}, {"variations": 2**31},
+     {"polish": -1}, {"polish": 2**31}, {"steady": -1}],
 )  # fmt: skip
 def test_search_config_rejects_invalid_settings(wrong: dict) -> None:
     with pytest.raises(ValueError, match=f"^{next(iter(wrong))} is"):

@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ from tests.pipeline.made import lasting, made_job
 LEVELS, DEADLY = 8, 2
 SETTINGS = ("generate", f"levels={LEVELS}", "unit=1", "budget=5k")
 SPLIT = Path("data/5k/s")
+MEMORY: dict[str, Any] = {"object_store_memory": 80 * 2**20}  # of a node of Ray
 STALLED = 150  # s; longer than compiling keeps a worker of a fast machine silent
 
 
@@ -113,6 +115,22 @@ def test_require_reachable_names_an_invalid_address(address: str, monkeypatch: p
         require_reachable(address)
 
 
+def python(program: str, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run a program that starts a local Ray."""
+    environment = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}
+    environment |= {"RAY_raylet_start_wait_time_s": str(int(patience(COMMAND_SECONDS)))} | variables
+    command = [sys.executable, "-c", program, *arguments]
+    return subprocess.run(
+        command,
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=patience(COMMAND_SECONDS),
+        check=False,
+    )
+
+
 # A driver whose folder is recreated and taken over by another command before its worker starts. The worker commits
 # ready-made results by the real commit.
 CUT_OFF = """
@@ -161,10 +179,7 @@ with only_writer(split, print):
 def test_late_worker_commits_only_for_its_own_driver(tmp_path: Path) -> None:
     split = tmp_path / SPLIT
     split.mkdir(parents=True)
-    program = [sys.executable, "-c", CUT_OFF, str(split)]
-    done = subprocess.run(
-        program, cwd=ROOT, capture_output=True, text=True, timeout=patience(COMMAND_SECONDS), check=False
-    )
+    done = python(CUT_OFF, str(split))
     assert "Another command has taken over" in done.stderr, done.stderr
     assert not fragment_paths(split)
 
@@ -200,17 +215,7 @@ cluster.run(job, Path("data"), scheduler, settle, board, Stop())
 
 @pytest.mark.slow
 def test_a_worker_uses_the_cpu_where_jax_prefers_a_gpu() -> None:
-    environment = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}
-    environment |= {"JAX_PLATFORMS": "cuda,cpu", "RAY_raylet_start_wait_time_s": str(int(patience(COMMAND_SECONDS)))}
-    done = subprocess.run(
-        [sys.executable, "-c", ON_WHAT],
-        cwd=ROOT,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=patience(COMMAND_SECONDS),
-        check=False,
-    )
+    done = python(ON_WHAT, JAX_PLATFORMS="cuda,cpu")
     assert done.stderr.splitlines()[-1] == "cpu ['cpu']", done.stderr
 
 
@@ -296,48 +301,51 @@ def test_mismatch_names_what_differs() -> None:
         assert socket.gethostname() in refusal
 
 
+@pytest.fixture
+def machines() -> Iterator[Any]:
+    """Start a cluster whose head has no core."""
+    from ray.cluster_utils import Cluster
+
+    machines = Cluster(initialize_head=True, head_node_args=MEMORY | {"num_cpus": 0, "include_dashboard": False})
+    yield machines
+    machines.shutdown()
+
+
 @pytest.mark.campaign
 @pytest.mark.slow
-def test_run_survives_machines_that_join_and_leave(tmp_path: Path) -> None:
+def test_run_survives_machines_that_join_and_leave(tmp_path: Path, machines: Any) -> None:
     """Start a head without a core; add a node to the waiting run, add another, then remove the first.
 
     Workers run in another folder than the command, which names the split to continue from by a relative path.
     """
-    from ray.cluster_utils import Cluster
+    alone = "search.env_steps=0"  # so that experts leave levels to continue
+    endless = ("generate", "levels=1k", "unit=1", "budget=5k", "keep_experts=true", alone)
+    process = start(endless, tmp_path, address=str(machines.address))
+    until((tmp_path / SPLIT / JOB).exists, process)
+    first = machines.add_node(num_cpus=1, **MEMORY)
+    until(lambda: fragment_paths(tmp_path / SPLIT), process)
+    second = machines.add_node(num_cpus=1, **MEMORY)
+    until(lambda: works_on(second), process)
+    machines.remove_node(first, allow_graceful=False)
+    before = len(fragment_paths(tmp_path / SPLIT))
+    until(lambda: len(fragment_paths(tmp_path / SPLIT)) > before + LEVELS, process)
+    process.terminate()
+    _, err = process.communicate(timeout=patience(COMMAND_SECONDS))
+    assert process.returncode == 130, err
+    assert " is lost; others take over level" in err
+    assert "Traceback" not in err
 
-    memory: dict[str, Any] = {"object_store_memory": 80 * 2**20}
-    machines = Cluster(initialize_head=True, head_node_args=memory | {"num_cpus": 0, "include_dashboard": False})
-    try:
-        alone = "search.env_steps=0"  # so that experts leave levels to continue
-        endless = ("generate", "levels=1k", "unit=1", "budget=5k", "keep_experts=true", alone)
-        process = start(endless, tmp_path, address=str(machines.address))
-        until((tmp_path / SPLIT / JOB).exists, process)
-        first = machines.add_node(num_cpus=1, **memory)
-        until(lambda: fragment_paths(tmp_path / SPLIT), process)
-        second = machines.add_node(num_cpus=1, **memory)
-        until(lambda: works_on(second), process)
-        machines.remove_node(first, allow_graceful=False)
-        before = len(fragment_paths(tmp_path / SPLIT))
-        until(lambda: len(fragment_paths(tmp_path / SPLIT)) > before + LEVELS, process)
-        process.terminate()
-        _, err = process.communicate(timeout=patience(COMMAND_SECONDS))
-        assert process.returncode == 130, err
-        assert " is lost; others take over level" in err
-        assert "Traceback" not in err
+    rows = read_manifest(tmp_path / SPLIT).table.to_pylist()
+    trained = next(row for row in rows if row["label"] == "unsolved" and row["experts"])
+    (tmp_path / SPLIT / trained["experts"]).unlink()
+    words = ["regenerate", f"manifest={SPLIT}", "budget=8k", f"where=level_id = {trained['level_id']}"]
+    again = run([*words, "continue=true"], tmp_path, address=str(machines.address))
+    assert again.returncode == 3, again.stdout + again.stderr
+    (note,) = (tmp_path / "data/8k/s/quarantine").iterdir()
+    assert f"The experts in {tmp_path / SPLIT / trained['experts']} cannot be read" in note.read_text()
 
-        rows = read_manifest(tmp_path / SPLIT).table.to_pylist()
-        trained = next(row for row in rows if row["label"] == "unsolved" and row["experts"])
-        (tmp_path / SPLIT / trained["experts"]).unlink()
-        words = ["regenerate", f"manifest={SPLIT}", "budget=8k", f"where=level_id = {trained['level_id']}"]
-        again = run([*words, "continue=true"], tmp_path, address=str(machines.address))
-        assert again.returncode == 3, again.stdout + again.stderr
-        (note,) = (tmp_path / "data/8k/s/quarantine").iterdir()
-        assert f"The experts in {tmp_path / SPLIT / trained['experts']} cannot be read" in note.read_text()
-
-        own = run(["generate", "levels=1", "budget=5k", "out=own"], tmp_path)
-        assert own.returncode == 0, own.stderr  # it ignores a cluster that RAY_ADDRESS does not name
-    finally:
-        machines.shutdown()
+    own = run(["generate", "levels=1", "budget=5k", "out=own"], tmp_path)
+    assert own.returncode == 0, own.stderr  # it ignores a cluster that RAY_ADDRESS does not name
 
 
 @pytest.mark.campaign
@@ -391,26 +399,19 @@ def test_crew_replaces_a_stalled_worker(tmp_path: Path) -> None:
 
 @pytest.mark.campaign
 @pytest.mark.slow
-def test_lost_machines_and_a_restarted_driver_change_no_bit(tmp_path: Path) -> None:
-    from ray.cluster_utils import Cluster
-
-    memory: dict[str, Any] = {"object_store_memory": 80 * 2**20}
+def test_lost_machines_and_a_restarted_driver_change_no_bit(tmp_path: Path, machines: Any) -> None:
     command = ["generate", "levels=24", "unit=2", "budget=5k"]
-    machines = Cluster(initialize_head=True, head_node_args=memory | {"num_cpus": 0, "include_dashboard": False})
-    try:
-        first = machines.add_node(num_cpus=1, **memory)
-        process = start(command, tmp_path, address=str(machines.address))
-        until(lambda: fragment_paths(tmp_path / SPLIT), process)
-        machines.remove_node(first, allow_graceful=False)
-        machines.add_node(num_cpus=1, **memory)
-        before = len(fragment_paths(tmp_path / SPLIT))
-        until(lambda: len(fragment_paths(tmp_path / SPLIT)) > before, process)
-        process.kill()
-        process.communicate()
-        again = run(command, tmp_path, address=str(machines.address))
-        assert again.returncode == 0, again.stderr
-    finally:
-        machines.shutdown()
+    first = machines.add_node(num_cpus=1, **MEMORY)
+    process = start(command, tmp_path, address=str(machines.address))
+    until(lambda: fragment_paths(tmp_path / SPLIT), process)
+    machines.remove_node(first, allow_graceful=False)
+    machines.add_node(num_cpus=1, **MEMORY)
+    before = len(fragment_paths(tmp_path / SPLIT))
+    until(lambda: len(fragment_paths(tmp_path / SPLIT)) > before, process)
+    process.kill()
+    process.communicate()
+    again = run(command, tmp_path, address=str(machines.address))
+    assert again.returncode == 0, again.stderr
     assert run([*command, "out=whole", "executor=inline"], tmp_path).returncode == 0
     assert repr(lasting(tmp_path / SPLIT)) == repr(lasting(tmp_path / "whole/5k/s"))
 

@@ -138,9 +138,3 @@ def test_kept_settings_omits_groups_that_a_preset_replaces() -> None:
     assert (same.procedure, same.distribution, same.task) == (made.procedure, made.distribution, made.task)
     assert masters.procedure == made_job("data", "procedure=masters").procedure
     assert (masters.distribution, masters.task) == (made.distribution, made.task)
-
-
-def test_regenerate_names_a_missing_split(tmp_path: Path) -> None:
-    done = here(["regenerate", "manifest=data/8k/s", "budget=1M"], tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.startswith("Error: There is no split at data/8k/s")

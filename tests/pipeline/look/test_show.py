@@ -140,11 +140,6 @@ def test_show_refuses_an_unknown_suffix(split, tmp_path, name) -> None:
     assert not (tmp_path / name).exists()
 
 
-def test_show_refuses_a_missing_split(tmp_path) -> None:
-    with pytest.raises(UserError, match="There is no split at"):
-        show(tmp_path / "nothing", 0, tmp_path / "level.gif")
-
-
 def test_show_refuses_an_unwritable_file(split, tmp_path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match=r"^Cannot write .*: choose another file with -o"):

@@ -37,14 +37,14 @@ from levelproof.pipeline.store import density, seal
 from levelproof.pipeline.store.contents import blank_row, table_for
 from levelproof.pipeline.store.density import CHECKSUM, key_rows, task_states
 from levelproof.pipeline.store.fields import arrays_of, same_bits, tree_of
+from levelproof.pipeline.store.formats import Encoding, field_table
 from levelproof.pipeline.store.layout import split_path
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.merge import Place
 from levelproof.pipeline.store.packing import pack, unpack
-from levelproof.pipeline.store.formats import Encoding, field_table
 from levelproof.pipeline.store.shard import EngineDiffers, Shard, read_together, stored_bytes, write_shard
 from levelproof.pipeline.store.split import writing
-from tests.pipeline.made import made_fields, made_job, made_verdict
+from tests.pipeline.made import assert_same, made_fields, made_job, made_verdict
 
 IDS = [5, 9, 12, 13]
 NAME = "shards/000000000005-000000000013-0123abcd.zarr"
@@ -59,13 +59,6 @@ def played(size: str = "s", rules: TaskParams = DEFAULT_RULES) -> dict[str, np.n
     levels = jax.tree.map(np.asarray, sample_levels(np.arange(count, dtype=np.int32), SIZES[size], Distribution()))
     action = np.repeat(np.random.default_rng(3).integers(0, 2, (32, 6, count)), 8, axis=0).astype(np.int32)
     return arrays_of(levels, "level/") | arrays_of(replay(levels, action, rules), "record/")
-
-
-def assert_same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
-    assert found.keys() == expected.keys()
-    for name, values in expected.items():
-        assert found[name].dtype == values.dtype
-        assert same_bits(found[name], values).all(), name
 
 
 def write(folder: Path, encoding: Encoding, fields: dict[str, np.ndarray] | None = None) -> Shard:
@@ -126,7 +119,7 @@ def test_every_density_restores_every_bit_of_larger_levels(tmp_path: Path, size:
     assert_same(write(tmp_path, encoding, played(size)).read(), played(size))
 
 
-@pytest.mark.parametrize("density", ["resume", "witness"])
+@pytest.mark.parametrize("density", ["full", "resume", "witness"])
 def test_read_returns_the_requested_rows_and_fields(tmp_path: Path, density: Any) -> None:
     shard = write(tmp_path, Encoding(density))
     assert_same(
@@ -349,7 +342,7 @@ def test_read_ends_for_senseless_states(tmp_path: Path) -> None:
 
 
 def test_field_tables_have_no_overlaps_in_any_encoding() -> None:
-    for encoding in (Encoding("resume"), *(Encoding("witness", every) for every in KEYS_EVERY)):
+    for encoding in (Encoding(), Encoding("resume"), *(Encoding("witness", every) for every in KEYS_EVERY)):
         table = table_for(SIZES["m"], encoding)
         for array in dict.fromkeys(field.array for field in table):
             ends = np.cumsum([0] + [field.extent for field in table if field.array == array])

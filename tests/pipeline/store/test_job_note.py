@@ -68,19 +68,13 @@ def test_read_note_refuses_invalid_notes(tmp_path: Path, text: str) -> None:
 
 
 def test_read_note_refuses_pipes_and_large_files(split: Path) -> None:
-    (split / JOB).unlink()
-    os.mkfifo(split / JOB)
-    with pytest.raises(NoteError):
-        read_note(split)
-    (split / JOB).unlink()
-    (split / JOB).symlink_to("/dev/zero")
-    with pytest.raises(NoteError):
-        read_note(split)
-    (split / JOB).unlink()
-    with (split / JOB).open("wb") as file:
-        file.truncate(2**30)
-    with pytest.raises(NoteError):
-        read_note(split)
+    note = split / JOB
+    large = lambda: (note.touch(), os.truncate(note, 2**30))
+    for put in (lambda: os.mkfifo(note), lambda: note.symlink_to("/dev/zero"), large):
+        note.unlink()
+        put()
+        with pytest.raises(NoteError):
+            read_note(split)
 
 
 def test_read_note_replaces_control_characters(split: Path) -> None:

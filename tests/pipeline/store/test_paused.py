@@ -4,7 +4,6 @@ import json
 import os
 from collections.abc import Iterator
 from dataclasses import replace
-from datetime import timedelta
 from pathlib import Path
 
 import jax
@@ -19,12 +18,11 @@ from levelproof.experts.training.slots import Pending
 from levelproof.experts.verdict.judge import Evaluation, KeptExpert
 from levelproof.pipeline.errors import StoreFailure
 from levelproof.pipeline.store import paused as store
-from levelproof.pipeline.store import remote
 from levelproof.pipeline.store.checkpoints import begun_like
 from levelproof.pipeline.store.layout import checkpoint_path, unit_name
 from levelproof.pipeline.store.paused import CheckpointUnread, drop_paused, load_paused, prune_paused, save_paused
 from tests.pipeline.made import made_job
-from tests.pipeline.servers import Server, bucket_of, serving
+from tests.pipeline.servers import Server, serving_bucket
 
 JOB = made_job("data", "budget=5k")
 UNIT = unit_name(3, 7)
@@ -195,19 +193,8 @@ def test_prune_keeps_a_checkpoint_of_another_version(split: Path) -> None:
 @pytest.fixture
 def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
     """Start a store with an empty bucket, whose responses this process awaits for a second."""
-    monkeypatch.setenv("LEVELPROOF_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=1))
-    monkeypatch.setitem(remote.RETRIES, "backoff", {"init_backoff": timedelta(milliseconds=5)})
-    (tmp_path / "s3/bucket").mkdir(parents=True)
-    with serving(bucket_of(tmp_path / "s3")) as server:
-        for name in [name for name in os.environ if name.startswith("AWS_")]:
-            monkeypatch.delenv(name)
-        known = {"ACCESS_KEY_ID": "any", "SECRET_ACCESS_KEY": "any", "REGION": "us-east-1", "ENDPOINT_URL": server.url}
-        for name, value in known.items():
-            monkeypatch.setenv(f"AWS_{name}", value)
-        remote._store.cache_clear()
+    with serving_bucket(monkeypatch, tmp_path, 1) as server:
         yield server
-    remote._store.cache_clear()
 
 
 def test_checkpoints_in_a_store_survive_time_outs(

@@ -34,7 +34,18 @@ from tests.pipeline.command import ROOT, TINY, run
 from tests.pipeline.command import here as command
 from tests.pipeline.driver import LEVELS, SPLIT, UNIT, commit_made, drive, require_same_content
 from tests.pipeline.made import honest_split
-from tests.pipeline.servers import AZURE_KEY, AZURE_NAME, Answer, Server, azure_process, bucket_of, s3_process, serving
+from tests.pipeline.servers import (
+    AZURE_KEY,
+    AZURE_NAME,
+    Answer,
+    Server,
+    azure_process,
+    bucket_of,
+    forget,
+    s3_process,
+    serving,
+    serving_bucket,
+)
 from tests.pipeline.servers import before as before_it
 
 OUT = "s3://bucket/data"
@@ -58,22 +69,11 @@ ALSO_MOTO = pytest.mark.parametrize(
 def server(
     request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moto: Any
 ) -> Iterator[Server]:
-    """Start a store with an empty bucket, with short time-outs and no cached metadata."""
-    monkeypatch.setenv("LEVELPROOF_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=patience(2)))
-    monkeypatch.setitem(remote.RETRIES, "backoff", {"init_backoff": timedelta(milliseconds=5)})
+    """Start a store with an empty bucket."""
     monkeypatch.setattr(leases, "POLL", 0.02)
-    (tmp_path / "s3/bucket").mkdir(parents=True)
-    answers = bucket_of(tmp_path / "s3") if getattr(request, "param", "") != "moto" else before_it(*moto())
-    with serving(answers) as server:
-        for name in [name for name in os.environ if name.startswith("AWS_")]:
-            monkeypatch.delenv(name)
-        known = {"ACCESS_KEY_ID": "any", "SECRET_ACCESS_KEY": "any", "REGION": "us-east-1", "ENDPOINT_URL": server.url}
-        for name, value in known.items():
-            monkeypatch.setenv(f"AWS_{name}", value)
-        forget()
+    answers = before_it(*moto()) if getattr(request, "param", "") == "moto" else None
+    with serving_bucket(monkeypatch, tmp_path, patience(2), answers) as server:
         yield server
-    forget()
 
 
 @pytest.fixture
@@ -86,13 +86,6 @@ def moto() -> Iterator[Any]:
 def empty() -> None:
     remove(remote.stored_in(THERE))
     forget()
-
-
-def forget() -> None:
-    remote._known.clear()
-    remote._store.cache_clear()
-    remote._cache_in.cache_clear()
-    leases._served.clear()
 
 
 def require_whole(here: Path) -> None:

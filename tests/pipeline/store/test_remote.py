@@ -37,7 +37,18 @@ from tests.pace import patience
 from tests.pipeline.command import ROOT, assert_refused
 from tests.pipeline.command import here as command
 from tests.pipeline.made import made_job, made_split, played_split
-from tests.pipeline.servers import HOST, Answer, Server, before, bucket_of, files_of, hub_of, s3_process, serving
+from tests.pipeline.servers import (
+    HOST,
+    Answer,
+    Server,
+    before,
+    bucket_of,
+    files_of,
+    forget,
+    hub_of,
+    s3_process,
+    serving,
+)
 
 UNITS = [[Label.SOLVED] * 2, [Label.UNSOLVED, Label.SOLVED, Label.SOLVED], [Label.SOLVED] * 4]
 KEYS = {"access_key_id": "any", "secret_access_key": "any", "region": "us-east-1"}
@@ -62,13 +73,6 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for name in [name for name in os.environ if name.startswith(("AWS_", "HF_", "GOOGLE_"))]:
         monkeypatch.delenv(name)
     forget()
-
-
-def forget() -> None:
-    """Drop what this process knows of stores, as if it had just started."""
-    remote._known.clear()
-    remote._store.cache_clear()
-    remote._cache_in.cache_clear()
 
 
 class Bucket(NamedTuple):

@@ -13,19 +13,12 @@ from levelproof.experts.witness.witness import Record
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.fields import arrays_of, same_bits, tree_of
+from levelproof.pipeline.store.formats import field_table
 from levelproof.pipeline.store.packing import pack, unpack
-from levelproof.pipeline.store.formats import ALONG_TIME, field_table
 from levelproof.pipeline.store.shard import Shard, stored_bytes, write_shard
-from tests.pipeline.made import made_fields, made_level, made_record
+from tests.pipeline.made import assert_same, made_fields, made_level, made_record
 
 LEVELS = [5, 9, 12]
-
-
-def assert_same(found: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
-    assert found.keys() == expected.keys()
-    for name, values in expected.items():
-        assert found[name].dtype == values.dtype
-        assert same_bits(found[name], values).all(), name
 
 
 @pytest.fixture(scope="module")
@@ -61,14 +54,6 @@ def test_unpack_inverts_pack(size: str, seed: int) -> None:
     assert_same({name: np.moveaxis(x, 0, -1) for name, x in levels_first.items()}, fields)
 
 
-def test_field_table_has_no_overlaps_or_gaps(fields: dict[str, np.ndarray]) -> None:
-    table = field_table(fields)
-    for name, packed in pack(fields, table).items():
-        taken = [range(place.first, place.first + place.count) for place in table if place.array == name]
-        assert sorted(i for places in taken for i in places) == list(range(packed.shape[1]))
-        assert packed.shape[2:] == ((RECORD_STEPS,) if name in ALONG_TIME else ())
-
-
 def test_pack_refuses_values_that_do_not_fit(fields: dict[str, np.ndarray]) -> None:
     fields = fields | {"record/action": np.full_like(fields["record/action"], 300)}
     with pytest.raises(ValueError, match="record/action has values from 300"):
@@ -86,11 +71,6 @@ def test_same_bits_distinguishes_signed_zeros_and_accepts_nan() -> None:
     assert same_bits(a, a.copy()).all()
     assert same_bits(a, -a).tolist() == [False, False, False]
     assert not same_bits(a, a.astype(np.float64)).any()
-
-
-@pytest.mark.parametrize("rows", [[0], [2, 0], [1, 1], [0, 1, 2], []])
-def test_read_keeps_the_requested_order(shard: Path, fields: dict[str, np.ndarray], rows: list[int]) -> None:
-    assert_same(Shard(shard).read(rows), {name: values[..., rows] for name, values in fields.items()})
 
 
 def test_read_opens_only_arrays_of_requested_fields(shard: Path, fields: dict[str, np.ndarray]) -> None:

@@ -33,6 +33,11 @@ def committed(job: JobConfig, split: Path) -> None:
     commit(job, split, WorkUnit((0, 1)), made_result([0, 1], [Label.SOLVED, Label.UNSOLVED]))
 
 
+def assert_refused(job: JobConfig, sentence: str) -> None:
+    with pytest.raises(UserError, match=sentence), writing(job, print):
+        pass
+
+
 def test_writing_creates_the_folder_of_budget_and_size(tmp_path: Path, job: JobConfig) -> None:
     with writing(job, print) as (split, manifest):
         assert split == tmp_path / "data/128k/s"
@@ -44,11 +49,7 @@ def test_writing_refuses_another_configuration_and_lists_differences(tmp_path: P
     with writing(job, print) as (split, _):
         committed(job, split)
     other = made_job(str(tmp_path / "data"), "expert.width=64", "task.frame_skip=3")
-    with (
-        pytest.raises(UserError, match=r"expert.width was 32, now 64; task.frame_skip was 2, now 3.*out=NAME"),
-        writing(other, print),
-    ):
-        pass
+    assert_refused(other, r"expert.width was 32, now 64; task.frame_skip was 2, now 3.*out=NAME")
 
 
 def test_writing_refuses_another_density(tmp_path: Path, job: JobConfig) -> None:
@@ -56,11 +57,10 @@ def test_writing_refuses_another_density(tmp_path: Path, job: JobConfig) -> None
     with writing(job, print) as (split, _):
         committed(job, split)
     words = ["density=witness", "key_every=16"]
-    with (
-        pytest.raises(UserError, match="has density=full, but this command asks for density=witness key_every=16: use"),
-        writing(made_job(str(tmp_path / "data"), *words), print),
-    ):
-        pass
+    assert_refused(
+        made_job(str(tmp_path / "data"), *words),
+        "has density=full, but this command asks for density=witness key_every=16: use",
+    )
 
 
 def test_writing_accepts_more_levels(tmp_path: Path, job: JobConfig) -> None:
@@ -89,8 +89,7 @@ def test_writing_resumes_a_split_with_the_hash_of_an_earlier_version(tmp_path: P
     assert hash_of(before) != job.hash
     split = written_with(job, before)
     other = made_job(job.out, "expert.width=64")
-    with pytest.raises(UserError, match=r"\(expert.width was 32, now 64\)"), writing(other, print):
-        pass
+    assert_refused(other, r"\(expert.width was 32, now 64\)")
     with writing(made_job(job.out, "expert.slots=3"), print) as (_, manifest):
         assert manifest.config == job.results
         commit(job, split, WorkUnit((2, 3)), made_result([2, 3], [Label.UNSOLVED, Label.UNSOLVED]))
@@ -103,8 +102,7 @@ def test_writing_resumes_a_split_with_the_hash_of_an_earlier_version(tmp_path: P
 def test_writing_refuses_a_split_made_with_removed_settings(tmp_path: Path, job: JobConfig) -> None:
     split = written_with(job, job.results | {"scout": {"rounds": 4}})
     message = r"\(scout.rounds was 4, now absent\): use the version of levelproof that made it, or another folder"
-    with pytest.raises(UserError, match=message), writing(job, print):
-        pass
+    assert_refused(job, message)
     assert read_manifest(split).level_ids.tolist() == [0, 1]
 
 
@@ -113,11 +111,7 @@ def test_writing_names_a_file_in_its_way(tmp_path: Path, job: JobConfig, place: 
     path = tmp_path / place
     path.parent.mkdir(parents=True, exist_ok=True)
     path.touch()
-    with (
-        pytest.raises(UserError, match=r"Cannot write to .*/data/128k/s \(.+\): choose another folder"),
-        writing(job, print),
-    ):
-        pass
+    assert_refused(job, r"Cannot write to .*/data/128k/s \(.+\): choose another folder")
 
 
 def test_writing_refuses_a_second_writer(job: JobConfig) -> None:
@@ -137,13 +131,8 @@ def test_writing_refuses_linked_folders(tmp_path: Path, job: JobConfig, name: st
     mine = elsewhere / "000000000000-000000000001-5f0c2a9b"
     mine.mkdir(parents=True)
     (split / name).symlink_to(elsewhere)
-    with (
-        pytest.raises(UserError, match=rf"{name} is a link: put a folder in its place, .* out=NAME"),
-        writing(job, print),
-    ):
-        pass
+    assert_refused(job, rf"{name} is a link: put a folder in its place, .* out=NAME")
     assert mine.is_dir()
     (split / name).unlink()
     (split / name).touch()
-    with pytest.raises(UserError, match=rf"{name} is not a folder"), writing(job, print):
-        pass
+    assert_refused(job, rf"{name} is not a folder")
