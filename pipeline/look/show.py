@@ -73,9 +73,7 @@ def film_of(source: Path, level_id: int | None, plays: bool = True) -> Film:
         Failure: the split is damaged.
     """
     if is_level_file(source):
-        if level_id is not None:
-            raise UserError(f"{source} is a level file, which has one level: leave out the id {level_id}.")
-        file = level_file(source)
+        file = level_file(source, level_id)
         size = name_of(file.level.size)
         caption = Caption(f"{' '.join(source.stem.split())} · size {size}")
         description = f"{source.name}, a level of size {size}: a level file has no witness"

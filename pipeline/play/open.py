@@ -52,9 +52,7 @@ def level_to_play(source: Path | None, level_id: int | None, size: str) -> tuple
     if source is None:
         return empty_file(size), None
     if is_level_file(source):
-        if level_id is not None:
-            raise UserError(f"{source} is a level file, which has one level: leave out the id {level_id}.")
-        file = level_file(source)
+        file = level_file(source, level_id)
         return file, witness_in(json.loads(source.read_bytes()), file)
     if level_id is None:
         raise UserError(f"Which level of {source}? Add its id: `levelproof inspect {source}` lists them.")

@@ -119,12 +119,14 @@ def is_level_file(source: Path) -> bool:
     return source.is_file() or (source.suffix.lower() == ".json" and not source.is_dir())
 
 
-def level_file(path: Path) -> LevelFile:
-    """Read a level file.
+def level_file(path: Path, level_id: int | None = None) -> LevelFile:
+    """Read a level file; `level_id` is an id that the user gave with it.
 
     Raises:
-        UserError: the file is unreadable or invalid.
+        UserError: the file is unreadable or invalid, or there is an id.
     """
+    if level_id is not None:
+        raise UserError(f"{path} is a level file, which has one level: leave out the id {level_id}.")
     try:
         return read_level_file(path)
     except LevelFileError as error:
