@@ -16,6 +16,10 @@ if not os.path.isdir(os.path.join(__path__[0], "physics")):
     )
 
 if TYPE_CHECKING:
+    from levelproof.experts.networks.saved import Policy as Policy
+    from levelproof.experts.networks.saved import PolicyError as PolicyError
+    from levelproof.experts.networks.saved import load_policy as load_policy
+    from levelproof.experts.networks.saved import save_policy as save_policy
     from levelproof.experts.witness.witness import Record as Record
     from levelproof.experts.witness.witness import replay as replay
     from levelproof.levelgen.files.entries import LevelFileError as LevelFileError
@@ -62,6 +66,8 @@ HOME = {
     "Lanes": "levelproof.levelgen.task.lanes",
     "Level": "levelproof.levelgen.level",
     "LevelFile": "levelproof.levelgen.files.level_file",
+    "Policy": "levelproof.experts.networks.saved",
+    "PolicyError": "levelproof.experts.networks.saved",
     "Record": "levelproof.experts.witness.witness",
     "Shard": "levelproof.pipeline.store.shard",
     "Size": "levelproof.physics.types",
@@ -69,12 +75,14 @@ HOME = {
     "__version__": "levelproof.pipeline.version",
     "draw": "levelproof.levelgen.pictures.raster",
     "levels_from": "levelproof.pipeline.exchange.tables",
+    "load_policy": "levelproof.experts.networks.saved",
     "make": "levelproof.pipeline.dataset.environment",
     "open": "levelproof.pipeline.dataset.dataset",
     "read_level_file": "levelproof.levelgen.files.level_file",
     "read_manifest": "levelproof.pipeline.store.manifest",
     "replay": "levelproof.experts.witness.witness",
     "sample_levels": "levelproof.levelgen.sampling.sampler",
+    "save_policy": "levelproof.experts.networks.saved",
     "starts": "levelproof.levelgen.task.environment",
     "to_gymnax": "levelproof.levelgen.task.to_gymnax",
     "write_level_file": "levelproof.levelgen.files.level_file",

@@ -1,0 +1,143 @@
+"""A policy for all levels, and the folder that keeps it: safetensors, and a JSON file that describes them."""
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax.typing import VariableDict
+from jaxtyping import Array, Float, Int, Key
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save
+
+from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy, policy_logits
+from levelproof.experts.policy import most_probable, sample
+from levelproof.levelgen.level import ACTIONS, Level, name_of, size_of
+from levelproof.levelgen.task.actions import action_mask
+from levelproof.levelgen.task.environment import ObservationType
+from levelproof.levelgen.task.rules import TaskState
+from levelproof.physics.types import Size, State
+
+WEIGHTS, CONFIG = "policy.safetensors", "config.json"
+FORMAT = 1  # of config.json
+
+
+class PolicyError(ValueError):
+    """A folder that holds no usable policy, or a level that the policy cannot play; the message is one sentence."""
+
+
+@dataclass(frozen=True, eq=False)
+class Policy:
+    """A policy for all levels; its methods are pure functions, to be called under `jax.jit` or not. Lanes are last.
+
+    Attributes:
+        network: the network's shape.
+        params: the network's parameters.
+        size: size of the levels that it can play; None: any size.
+        origin: how it was made, as JSON: what `save_policy` was given.
+    """
+
+    network: NetworkConfig
+    params: VariableDict
+    size: Size | None
+    origin: Mapping[str, Any]
+
+    @property
+    def observation_type(self) -> ObservationType:
+        """What the network reads of a state, as an observation of the environment."""
+        return self.network.observation_type
+
+    def logits(self, level: Level, state: State | TaskState) -> Float[Array, "16 lane"]:
+        """Return logits: three for each of four motor entries, then two for each of two thruster entries.
+
+        `experts.policy.log_probability` and `entropy` take them, with `levelgen.task.actions.action_mask`.
+
+        Args:
+            level: each lane's level; its `state` is not read.
+            state: each lane's world, or its episode.
+
+        Raises:
+            PolicyError: the policy was trained for another size.
+        """
+        if self.size not in (None, level.size):
+            raise PolicyError(
+                f"The policy plays levels of size {name_of(self.size)} only, not {name_of(level.size)}: "
+                "policies with network.kind=attention play any."
+            )
+        world = state.state if isinstance(state, TaskState) else state
+        lanes = world.rotation.shape[-1]
+        level = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], lanes)), level)
+        return policy_logits(self.params, self.network, level, world)
+
+    def sample(self, key: Key[Array, ""], level: Level, state: State | TaskState) -> Int[Array, "6 lane"]:
+        """Sample actions; entries that have no effect in a lane's level are 0."""
+        logits = self.logits(level, state)
+        action = sample(logits, jax.random.uniform(key, (ACTIONS, logits.shape[-1])))
+        return jnp.where(action_mask(level), action, 0)
+
+    def most_probable(self, level: Level, state: State | TaskState) -> Int[Array, "6 lane"]:
+        """Return the most probable actions; entries that have no effect in a lane's level are 0."""
+        return jnp.where(action_mask(level), most_probable(self.logits(level, state)), 0)
+
+
+def save_policy(folder: str | os.PathLike[str], policy: Policy) -> None:
+    """Write a policy to `folder`, which is created, each file whole or not at all."""
+    path = Path(folder)
+    path.mkdir(parents=True, exist_ok=True)
+    size = policy.size and name_of(policy.size)
+    config = {"format": FORMAT, "network": asdict(policy.network), "size": size, "origin": dict(policy.origin)}
+    arrays = {name: np.ascontiguousarray(x) for name, x in named(policy.params).items()}
+    for name, content in (WEIGHTS, save(arrays)), (CONFIG, (json.dumps(config, indent=2) + "\n").encode()):
+        (path / f"{name}.tmp").write_bytes(content)
+        (path / f"{name}.tmp").replace(path / name)
+
+
+def load_policy(folder: str | os.PathLike[str]) -> Policy:
+    """Load the policy that `save_policy` or `levelproof clone` wrote.
+
+    Raises:
+        PolicyError: the folder has no policy, or it is damaged or of a later version.
+    """
+    path = Path(folder)
+    try:
+        config = json.loads((path / CONFIG).read_text())
+        if config["format"] != FORMAT:
+            raise PolicyError(f"The policy {path} has format {config['format']}, this version reads {FORMAT}: update.")
+        shape = config["network"]
+        network = NetworkConfig(**shape | {"kind": PolicyKind(shape["kind"])})
+        size = None if config["size"] is None else size_of(config["size"])
+        wanted = jax.eval_shape(lambda: initial_policy(jax.random.key(0), network, size or size_of("m")))
+        params = unnamed(wanted, load_file(path / WEIGHTS))
+    except FileNotFoundError:
+        raise PolicyError(f"There is no policy in {path}: `levelproof clone SPLIT -o {path}` makes one.") from None
+    except (OSError, KeyError, TypeError, ValueError, SafetensorError) as error:
+        if isinstance(error, PolicyError):
+            raise
+        raise PolicyError(f"The policy in {path} is damaged ({error}): make or copy it again.") from None
+    return Policy(network, params, size, config["origin"])
+
+
+def named(tree: Any) -> dict[str, np.ndarray]:
+    """Return a pytree's arrays by the path of each."""
+    return {jax.tree_util.keystr(path): np.asarray(x) for path, x in jax.tree_util.tree_leaves_with_path(tree)}
+
+
+def unnamed(like: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """Return a pytree with the structure of `like`, and the arrays that `named` gave.
+
+    Raises:
+        ValueError: an array is missing, or has another shape or type.
+    """
+
+    def find(path: Any, x: Any) -> Array:
+        found = arrays.get(name := jax.tree_util.keystr(path))
+        if found is None or found.shape != x.shape or found.dtype != x.dtype:
+            raise ValueError(f"the array {name} is missing or has another shape")
+        return jnp.asarray(found)
+
+    return jax.tree_util.tree_map_with_path(find, like)
