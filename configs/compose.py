@@ -16,6 +16,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from levelproof.configs.clone import CloneConfig
 from levelproof.configs.convert import flat, plain, typed
 from levelproof.configs.errors import ConfigError, suggestion
 from levelproof.configs.schema import JobConfig, from_files, hash_of
@@ -192,3 +193,19 @@ def _in_grammar(value: Any) -> str:
         return repr(value)
     unquoted = value.isidentifier() and OverridesParser.create().parse_override(f"name={value}").value() == value
     return value if unquoted else QuotedString(value, Quote.single).with_quotes()
+
+
+def compose_clone(overrides: Sequence[str]) -> CloneConfig:
+    """Return the settings of `levelproof clone` that `overrides` (`key=value` strings) change.
+
+    Raises:
+        ConfigError: a setting is unknown or has a wrong value.
+    """
+    known, nested = flat(plain(CloneConfig())), {}
+    for override in map(_parse, overrides):
+        key = override.key_or_group
+        if key not in known:
+            raise ConfigError(f"there is no setting {key}{suggestion(key, known)}: choose one of {', '.join(known)}.")
+        group, _, name = key.rpartition(".")
+        (nested.setdefault(group, {}) if group else nested)[name] = override.value()
+    return typed(CloneConfig, nested)

@@ -18,8 +18,8 @@ from levelproof.pipeline.urls import require_here, require_known
 from levelproof.pipeline.version import __version__
 
 NAMES = (
-    "generate regenerate settings sample inspect columns plan diff show gallery play export import_ card status verify "
-    "seal"
+    "generate regenerate settings sample inspect columns plan diff show gallery play clone export import_ card status "
+    "verify seal"
 )
 OUTPUTS = ("out", "plot")  # arguments whose paths must be on this machine
 COMMANDS = [import_module(f"levelproof.pipeline.cli.{name}") for name in NAMES.split()]
@@ -33,6 +33,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None) -> int:
     arguments, unknown = _parser().parse_known_args(argv)
+    if hasattr(arguments, "words") and not any(word.startswith("-") for word in unknown):
+        arguments.words, unknown = [*arguments.words, *unknown], []  # words after an option, which argparse leaves over
     warnings.showwarning = lambda message, *_: print(f"Warning: {message}", file=sys.stderr)
     try:
         if unknown:

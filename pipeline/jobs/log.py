@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib import import_module
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from levelproof.configs.schema import JobConfig
 from levelproof.pipeline.errors import UserError
@@ -69,7 +69,7 @@ def logged(job: JobConfig, split: Path, say: Callable[[str], None]) -> Iterator[
         with harmless():
             if not is_remote(split) and folder.is_symlink():
                 raise UserError(f"{folder} is a link, but a split's folders must lie inside it")
-            opened = (TensorBoardWriter if job.log == "tensorboard" else WandbWriter)(job, folder)
+            opened = writer_of(job.log, folder, "levels/committed", f"{job.budget}/{job.size}", job.results)
             say(f"Scalars for {job.log}: {opened.place}")
             writer = opened
     try:
@@ -78,6 +78,11 @@ def logged(job: JobConfig, split: Path, say: Callable[[str], None]) -> Iterator[
         if writer:
             with harmless():
                 writer.close(done)
+
+
+def writer_of(log: str, folder: Path, step: str, name: str, settings: Mapping[str, Any]) -> ScalarWriter:
+    """Open the writer that `log` names: `step` is the scalar to plot over, `name` and `settings` describe the run."""
+    return TensorBoardWriter(folder, step) if log == "tensorboard" else WandbWriter(folder, step, name, settings)
 
 
 def scalars(began: Event, state: Event) -> dict[str, float]:
@@ -103,21 +108,22 @@ def scalars(began: Event, state: Event) -> dict[str, float]:
 
 
 class TensorBoardWriter:
-    """A file of TensorBoard events; the step is the number of levels committed.
+    """A file of TensorBoard events.
 
     Bypasses tensorboardX's writer thread: a full disk kills that thread, and its full queue then blocks the caller.
     """
 
-    def __init__(self, _: JobConfig, folder: Path) -> None:
+    def __init__(self, folder: Path, step: str) -> None:
         writer, self._summary, self._events = (
             import_module(f"tensorboardX.{name}") for name in ("event_file_writer", "summary", "proto.event_pb2")
         )
         run = folder / f"{datetime.now(UTC):%Y%m%dT%H%M%S}"
         run.mkdir(parents=True, exist_ok=True)
+        self._step = step
         self._writer, self.place = writer.EventsWriter(str(run / "events")), str(run)
 
     def write(self, scalars: Mapping[str, float]) -> None:
-        now, step = datetime.now(UTC).timestamp(), int(scalars["levels/committed"])
+        now, step = datetime.now(UTC).timestamp(), int(scalars[self._step])
         for name, value in scalars.items():
             summary = self._summary.scalar(name, value)
             self._writer.write_event(self._events.Event(wall_time=now, step=step, summary=summary))
@@ -128,19 +134,19 @@ class TensorBoardWriter:
 
 
 class WandbWriter:
-    """A run of Weights & Biases; the step is the number of levels committed. WANDB_PROJECT, WANDB_MODE etc. apply."""
+    """A run of Weights & Biases. WANDB_PROJECT, WANDB_MODE etc. apply."""
 
-    def __init__(self, job: JobConfig, folder: Path) -> None:
+    def __init__(self, folder: Path, step: str, name: str, settings: Mapping[str, Any]) -> None:
         wandb = import_module("wandb")
         folder.mkdir(parents=True, exist_ok=True)
         self._run = wandb.init(
             project=os.environ.get("WANDB_PROJECT", PROJECT),
-            name=f"{job.budget}/{job.size}",
-            config=job.results,
+            name=name,
+            config=dict(settings),
             dir=folder.absolute(),
             settings=wandb.Settings(console="off", silent=True, disable_git=True),
         )
-        self._run.define_metric("*", step_metric="levels/committed")
+        self._run.define_metric("*", step_metric=step)
         here = str(Path(self._run.dir).parent)
         self.place = here if self._run.offline else self._run.url or here
 

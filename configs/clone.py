@@ -1,0 +1,31 @@
+"""The settings of `levelproof clone`."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from levelproof.experts.imitation import ImitationConfig
+from levelproof.experts.networks.over_levels import NetworkConfig
+from levelproof.physics.bounds import require
+
+
+@dataclass(frozen=True)
+class CloneConfig:
+    """What to clone, and how."""
+
+    where: str = "label = 'solved'"  # SQL condition on the manifest's columns that selects levels
+    episodes: Literal["first", "all"] = "first"  # first: each record up to its first goal; all: whole records
+    validation: float = 0.1  # share of the levels that are kept from training, chosen by content hash
+    pool: int = 16_384  # levels in memory, between which every update draws evenly
+    refresh: int = 1000  # updates until other levels take their place, if the splits have more
+    interval: int = 500  # updates between validations, each with a checkpoint
+    seed: int = 0  # of the initial weights and of what is drawn
+    log: Literal["none", "tensorboard", "wandb"] = "none"  # logger of scalars, besides metrics.jsonl
+    network: NetworkConfig = field(default_factory=NetworkConfig)  # network of the policy
+    train: ImitationConfig = field(default_factory=ImitationConfig)  # training of the policy
+
+    def __post_init__(self) -> None:
+        require(self, ("pool", "refresh", "interval"), 1)
+        require(self, ("seed",), 0, 2**31 - 1)
+        require(self, ("validation",), 0, 1)
+        if self.validation in (0, 1):
+            raise ValueError(f"validation is {self.validation}: it must be between 0 and 1, and neither")

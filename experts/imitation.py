@@ -1,0 +1,121 @@
+"""Behaviour cloning of one policy over many levels: its loss, its optimiser and its update; reads no files."""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax.typing import VariableDict
+from jaxtyping import Array, Float, Int
+
+from levelproof.experts.networks.over_levels import NetworkConfig, initial_policy, policy_logits
+from levelproof.experts.policy import log_probability, most_probable
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.actions import action_mask
+from levelproof.physics.bounds import require
+from levelproof.physics.buffers import zeros_of
+from levelproof.physics.types import Size, State
+
+MOTION = 6  # numbers of a body: position, velocity, rotation, angular velocity
+
+
+@dataclass(frozen=True)
+class ImitationConfig:
+    """Hyperparameters of cloning (hashable: pass as a static argument)."""
+
+    updates: int = 20_000  # updates of the weights
+    batch: int = 1024  # transitions of an update
+    learning_rate: float = 1e-3  # largest step size of AdamW; falls to 0 along a cosine
+    warmup: int = 500  # updates over which the step size grows from 0; at most half of all
+    weight_decay: float = 1e-4  # of AdamW
+    max_gradient_norm: float = 1.0  # maximum global norm of the gradient
+    average: float = 0.999  # weight of the past in the running average of the weights, which is the policy
+
+    def __post_init__(self) -> None:
+        require(self, ("updates", "batch"), 1)
+        require(self, ("learning_rate", "max_gradient_norm"), 0, above=True)
+        require(self, ("warmup", "weight_decay"), 0)
+        require(self, ("average",), 0, 1)
+
+
+class Transitions(NamedTuple):
+    """Steps of witnesses: levels, what moves in them, and the actions taken."""
+
+    level: Level  # lanes last; `state` is None
+    motion: Float[Array, "lane column"]  # MOTION numbers for each body, as `as_motion` lays them out
+    action: Int[Array, "lane 6"]
+
+
+class Imitation(NamedTuple):
+    """Training under way."""
+
+    params: VariableDict
+    optimiser: optax.OptState
+    average: VariableDict
+    updates: Int[Array, ""]
+
+
+class Likeness(NamedTuple):
+    """How a policy's actions compare with the data's, averaged over live entries, then over transitions."""
+
+    loss: Float[Array, ""]  # nats, negative log-likelihood
+    accuracy: Float[Array, ""]  # share of entries whose most probable choice was taken
+
+
+def optimiser_of(config: ImitationConfig) -> optax.GradientTransformation:
+    warmup = min(config.warmup, config.updates // 2)
+    schedule = optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, warmup, config.updates)
+    clip = optax.clip_by_global_norm(config.max_gradient_norm)
+    return optax.chain(clip, optax.adamw(schedule, weight_decay=config.weight_decay))
+
+
+@partial(jax.jit, static_argnames=("network", "size", "config"))
+def begin_imitation(seed: Int[Array, ""], network: NetworkConfig, size: Size, config: ImitationConfig) -> Imitation:
+    """Initialise a policy; `size` is that of the levels if the network fits one size only."""
+    params = initial_policy(jax.random.key(seed), network, size)
+    return Imitation(params, optimiser_of(config).init(params), params, jnp.int32(0))
+
+
+@partial(jax.jit, static_argnames=("network", "config"), donate_argnums=0)
+def imitate(
+    now: Imitation, seen: Transitions, network: NetworkConfig, config: ImitationConfig
+) -> tuple[Imitation, Likeness]:
+    """Take one update; return the likeness before it."""
+    (_, likeness), gradient = jax.value_and_grad(_loss, has_aux=True)(now.params, seen, network)
+    change, state = optimiser_of(config).update(gradient, now.optimiser, now.params)
+    params: Any = optax.apply_updates(now.params, change)
+    # The first updates count for more, so that the average soon forgets the initial weights
+    kept = jnp.minimum(config.average, (1.0 + now.updates) / (10.0 + now.updates))
+    average = jax.tree.map(lambda old, new: kept * old + (1 - kept) * new, now.average, params)
+    return Imitation(params, state, average, now.updates + 1), likeness
+
+
+@partial(jax.jit, static_argnames="network")
+def compare(params: VariableDict, seen: Transitions, network: NetworkConfig) -> Likeness:
+    """Compare a policy with data."""
+    return _loss(params, seen, network)[1]
+
+
+def _loss(params: VariableDict, seen: Transitions, network: NetworkConfig) -> tuple[Float[Array, ""], Likeness]:
+    lanes, size, action = len(seen.motion), seen.level.size, seen.action.T
+    state = from_motion(seen.motion, size)
+    logits = policy_logits(params, network, replace(seen.level, state=state), state)
+    live = jnp.broadcast_to(action_mask(seen.level), (len(action), lanes))
+    count = jnp.maximum(live.sum(0), 1)
+    loss = -(log_probability(logits, action, live) / count).mean()
+    right = ((most_probable(logits) == action) & live).sum(0) / count
+    return loss, Likeness(loss, right.mean())
+
+
+def from_motion(motion: Float[Array, "lane column"], size: Size) -> State:
+    """Return the states, without contacts and impulses, which no network reads."""
+    by_body = motion.reshape(len(motion), size.bodies, MOTION).transpose(1, 2, 0)
+    return replace(
+        zeros_of(State, size, len(motion)),
+        position=by_body[:, 0:2],
+        velocity=by_body[:, 2:4],
+        rotation=by_body[:, 4],
+        angular_velocity=by_body[:, 5],
+    )

@@ -1,0 +1,146 @@
+"""The levels in memory that updates draw from: a pure function of the splits, the settings and the update's number.
+
+So a run that was killed continues with the same batches, without a position to keep.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int
+
+from levelproof.configs.clone import CloneConfig
+from levelproof.experts.imitation import Transitions
+from levelproof.levelgen.level import Level
+from levelproof.pipeline.dataset.batch import Batch
+from levelproof.pipeline.dataset.dataset import Dataset
+from levelproof.pipeline.dataset.order import EpochOrder
+from levelproof.pipeline.runtime import own_cores
+
+AT_ONCE = 64  # levels of a read
+MOTION_FIELDS = tuple(f"record/state/{name}" for name in ("position", "velocity", "rotation", "angular_velocity"))
+VALIDATED = 1024  # largest number of levels of a split that are validated on
+DRAWN = 8  # transitions of each of them
+
+
+class LevelPool(NamedTuple):
+    """Levels, and the steps of their episodes one after another."""
+
+    level: Level  # level axis last; `state` is None
+    first: Int[np.ndarray, " level"]  # row of each level's first step
+    steps: Int[np.ndarray, " level"]
+    motion: Float[np.ndarray, "row column"]
+    action: Int[np.ndarray, "row 6"]
+
+    def draw(self, rng: np.random.Generator, levels: Int[np.ndarray, " lane"]) -> Transitions:
+        """Draw a step of each of these levels, all steps equally likely."""
+        row = self.first[levels] + (rng.random(len(levels)) * self.steps[levels]).astype(np.int64)
+        level = jax.tree.map(lambda x: x[..., levels], self.level)
+        return Transitions(level, self.motion[row], self.action[row].astype(np.int32))
+
+
+class Source(NamedTuple):
+    """The levels of one split that are trained on, and those that are validated on."""
+
+    data: Dataset
+    train: Int[np.ndarray, " level"]
+    validation: Int[np.ndarray, " level"]
+
+
+def read_pool(
+    data: Dataset, indices: Int[np.ndarray, " level"], whole: bool, follow: Callable[[int], None] = lambda _: None
+) -> LevelPool:
+    """Read levels into memory; `follow` is told of each read how many levels it had."""
+
+    def read(some: Int[np.ndarray, " level"]) -> LevelPool:
+        batch = data.read(some, fields=["level", *MOTION_FIELDS], observation=None)
+        return _cut(batch, whole)
+
+    with ThreadPoolExecutor(len(own_cores())) as threads:
+        parts = []
+        for part in threads.map(read, (indices[i : i + AT_ONCE] for i in range(0, len(indices), AT_ONCE))):
+            parts.append(part)
+            follow(len(part.steps))
+    steps = np.concatenate([part.steps for part in parts])
+    level = jax.tree.map(lambda *xs: np.concatenate(xs, -1), *(part.level for part in parts))
+    motion, action = (np.concatenate([part[i] for part in parts]) for i in (3, 4))
+    return LevelPool(level, np.cumsum(steps) - steps, steps, motion, action)
+
+
+def _cut(batch: Batch, whole: bool) -> LevelPool:
+    """Keep the steps that are trained on, and of states what moves."""
+    count, length = batch.done.shape
+    ends = np.where(batch.done.any(1), batch.done.argmax(1) + 1, length)
+    steps = np.full(count, length) if whole else ends
+    kept = np.arange(length) < steps[:, None]
+    parts = [batch.fields[name] for name in MOTION_FIELDS]
+    columns = [x if x.ndim == 4 else x[..., None] for x in parts]
+    motion = np.concatenate(columns, -1).reshape(count, length, -1)[kept]
+    level = jax.tree.map(lambda x: np.moveaxis(x, 0, -1), replace(batch.level, state=None))  # pyright: ignore
+    return LevelPool(level, np.cumsum(steps) - steps, steps, motion, batch.action[kept].astype(np.int8))
+
+
+class Feed:
+    """The batches of all updates, read and drawn ahead by threads."""
+
+    def __init__(self, sources: Sequence[Source], config: CloneConfig, follow: Callable[[int], None]) -> None:
+        self._sources, self._config, self._follow = sources, config, follow
+        counts = np.array([len(source.train) for source in sources])
+        self._weights = counts / counts.sum()
+        shares = [min(count, -(-config.pool * count // counts.sum())) for count in counts.tolist()]
+        self._orders = [EpochOrder(*pair, config.seed) for pair in zip(counts.tolist(), shares, strict=True)]
+
+    @property
+    def levels(self) -> int:
+        """Number of levels of a round."""
+        return sum(order.batch_size for order in self._orders)
+
+    def batches(self, first: int) -> Iterator[Transitions]:
+        """Yield the batches of all updates from number `first` on."""
+        config = self._config
+        with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as drawer:
+            turn = self._turn(first)
+            pools = self._read(turn)
+            coming = reader.submit(self._read, turn + 1) if self._changes else None
+            ahead = drawer.submit(self._draw, pools, first)
+            for update in range(first, config.train.updates):
+                now = ahead.result()
+                if (after := self._turn(update + 1)) != turn and coming and update + 1 < config.train.updates:
+                    turn, pools = after, coming.result()
+                    coming = reader.submit(self._read, turn + 1)
+                ahead = drawer.submit(self._draw, pools, update + 1)
+                yield now
+
+    @property
+    def _changes(self) -> bool:
+        return any(order.batch_size < order.count for order in self._orders)
+
+    def _turn(self, update: int) -> int:
+        return update // self._config.refresh if self._changes else 0
+
+    def _read(self, turn: int) -> list[LevelPool]:
+        pools = []
+        for source, order in zip(self._sources, self._orders, strict=True):
+            items, _ = order.items(turn)  # an epoch's last round is filled up with levels of the next one's first
+            pools.append(read_pool(source.data, source.train[items], self._config.episodes == "all", self._follow))
+        return pools
+
+    def _draw(self, pools: Sequence[LevelPool], update: int) -> Transitions:
+        """Draw an update's batch: of one split, because levels of one shape go through a program together."""
+        rng = np.random.default_rng([self._config.seed, update])
+        pool = pools[rng.choice(len(pools), p=self._weights)]
+        return pool.draw(rng, rng.integers(0, len(pool.steps), self._config.train.batch))
+
+
+def validation_batches(source: Source, config: CloneConfig) -> list[Transitions]:
+    """Return whole batches of transitions of a split's validation levels, the same in every run."""
+    rng = np.random.default_rng(config.seed)
+    chosen = rng.permutation(source.validation)[:VALIDATED]
+    pool = read_pool(source.data, chosen, config.episodes == "all")
+    levels = np.tile(np.arange(len(chosen)), DRAWN)
+    batch = config.train.batch
+    padded = np.resize(levels, -(-len(levels) // batch) * batch)
+    return [pool.draw(rng, padded[i : i + batch]) for i in range(0, len(padded), batch)]
