@@ -26,7 +26,7 @@ def run(arguments: argparse.Namespace) -> None:
     from levelproof.pipeline.urls import require_known
 
     settings = [word for word in arguments.words if "=" in word and not Path(word).exists()]
-    splits = [Path(word) for word in arguments.words if word not in settings]
+    splits = [Path(word) for word in dict.fromkeys(arguments.words) if word not in settings]
     if not splits:
         raise UserError("There is no split to clone: name one, as in `levelproof clone data/128k/s`.")
     for split in splits:

@@ -131,28 +131,30 @@ def train(
 ) -> Imitation:
     """Take the updates that are left; validate, and write a checkpoint, every `config.interval` of them."""
     size, note, last = size_for(sources, config), note_of(sources, config), config.train.updates
-    first, recent, began = int(state.updates), [], time.monotonic()
+    first, recent, began, aside = int(state.updates), [], time.monotonic(), 0.0
     with shown(console, last, first) as show:
         feed = Feed(sources, config, lambda count: show(0, f"reading {count} levels"))
         held = {str(source.data.split): validation_batches(source, config) for source in sources}
         for update, seen in enumerate(feed.batches(first), first + 1):
             state, likeness = imitate(state, seen, config.network, config.train)
             recent.append(likeness)
+            jax.block_until_ready(likeness)
             if update == first + 1:
-                jax.block_until_ready(likeness)
                 began = time.monotonic()  # reading and compiling do not count
-            rate = (update - first - 1) / max(time.monotonic() - began, 1e-9)
+            rate = (update - first - 1) / max(time.monotonic() - began - aside, 1e-9)
             pace = (
                 f"{rate * config.train.batch:,.0f} samples/s · about {duration((last - update) / max(rate, 1e-9))} left"
             )
             show(1, f"{update:,}/{last:,} updates · {pace}")
             if update % config.interval == 0 or update == last:
+                paused = time.monotonic()
                 numbers = {STEP: update, "bc/samples_per_second": rate * config.train.batch}
                 numbers |= averages("", recent) | validated(state, held, config)
                 recent = []
                 keep(out, state, config, size, note)
                 metrics.write(numbers)
-                say(console, f"{line(update, last, numbers)} · {pace}")
+                say(console, f"{line_of(update, last, numbers)} · {pace}")
+                aside += time.monotonic() - paused
     return state
 
 
@@ -170,7 +172,7 @@ def averages(prefix: str, likenesses: Sequence[Any]) -> dict[str, float]:
     return {f"bc/{prefix}{name}": float(np.mean([getattr(x, name) for x in likenesses])) for name in names}
 
 
-def line(update: int, last: int, numbers: dict[str, float]) -> str:
+def line_of(update: int, last: int, numbers: dict[str, float]) -> str:
     loss, accuracy = (numbers[f"bc/validation_{name}"] for name in ("loss", "accuracy"))
     return f"{update:,}/{last:,} updates · loss {numbers['bc/loss']:.3f} · validation {loss:.3f}, {accuracy:.1%} right"
 

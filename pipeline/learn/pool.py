@@ -90,13 +90,9 @@ class Feed:
         self._sources, self._config, self._follow = sources, config, follow
         counts = np.array([len(source.train) for source in sources])
         self._weights = counts / counts.sum()
-        shares = [min(count, -(-config.pool * count // counts.sum())) for count in counts.tolist()]
-        self._orders = [EpochOrder(*pair, config.seed) for pair in zip(counts.tolist(), shares, strict=True)]
-
-    @property
-    def levels(self) -> int:
-        """Number of levels of a round."""
-        return sum(order.batch_size for order in self._orders)
+        total = int(counts.sum())
+        share = lambda count: min(count, -(-config.pool * count // total))
+        self._orders = [EpochOrder(count, share(count), config.seed) for count in counts.tolist()]
 
     def batches(self, first: int) -> Iterator[Transitions]:
         """Yield the batches of all updates from number `first` on."""

@@ -128,14 +128,14 @@ def made_job(out: str = "data", *overrides: str) -> JobConfig:
     return compose_job([f"out={out}", "executor=inline", *overrides])
 
 
-def played_split(folder: Path, held: int = 16) -> Path:
-    """Make a real split in `folder`: levels of size s under random actions, each held for `held` env steps.
+def played_split(folder: Path, held: int = 16, size: str = "s") -> Path:
+    """Make a real split in `folder`: levels under random actions, each held for `held` env steps.
 
     Levels whose episode reaches the goal are labelled solved.
     """
-    job = made_job(str(folder), "size=s", f"levels={PLAYED}")
+    job = made_job(str(folder), f"size={size}", f"levels={PLAYED}")
     ids = np.arange(PLAYED, dtype=np.int32)
-    levels = jax.tree.map(np.asarray, sample_levels(jnp.asarray(ids), SIZES["s"], job.distribution))
+    levels = jax.tree.map(np.asarray, sample_levels(jnp.asarray(ids), SIZES[size], job.distribution))
     rng = np.random.default_rng(0)
     action = np.repeat(rng.integers(0, 2, (RECORD_STEPS // held, 6, PLAYED)), held, axis=0).astype(np.int32)
     record = replay(levels, action, job.task)

@@ -1,0 +1,101 @@
+"""Networks for all levels: any size, any order of entities, and the same bits after saving."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import levelproof
+from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy
+from levelproof.experts.networks.saved import CONFIG, WEIGHTS, Policy
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.task.actions import action_mask
+from levelproof.levelgen.task.rules import reset
+
+COUNT = 16
+
+
+def policy_of(kind: PolicyKind, size: str = "s") -> Policy:
+    """Return a policy with random weights in every layer, so that no logit is close to 0."""
+    network = NetworkConfig(kind, width=16)
+    params = initial_policy(jax.random.key(0), network, SIZES[size])
+    leaves, tree = jax.tree.flatten(params)
+    rng = np.random.default_rng(0)
+    params = jax.tree.unflatten(tree, [x + rng.normal(size=x.shape, scale=0.2).astype(np.float32) for x in leaves])
+    return Policy(network, params, SIZES[size] if kind is PolicyKind.FLAT else None, {"made": "for a test"})
+
+
+def shuffled(level: Level) -> Level:
+    """Reverse the order of movable polygons, circles, joints and thrusters."""
+    size, model = level.size, level.model
+    polygons = np.r_[0:4, np.arange(4, size.polygons)[::-1]]
+    bodies = np.r_[polygons, np.arange(size.polygons, size.bodies)[::-1]]
+    new = np.argsort(bodies)  # new index of each body
+    of_body = ("active", "inverse_mass", "inverse_inertia", "friction", "restitution", "collision_mode")
+    changed = {name: getattr(model, name)[bodies] for name in of_body}
+    changed |= {name: getattr(model, name)[polygons] for name in ("vertices", "n_vertices")}
+    changed |= {"radius": model.radius[::-1], "collides": model.collides[bodies][:, bodies]}
+    for name in vars(model):
+        if name.startswith(("joint_", "motor_", "thruster_")):
+            x = np.asarray(getattr(model, name))
+            changed[name] = (new[x] if name in ("joint_a", "joint_b", "thruster_body") else x)[::-1]
+    moving = {
+        name: getattr(level.state, name)[bodies] for name in ("position", "rotation", "velocity", "angular_velocity")
+    }
+    of_task = {name: getattr(level, name)[::-1] for name in ("motor_binding", "motor_auto", "thruster_binding")}
+    of_task |= {name: getattr(level, name)[bodies] for name in ("role", "density")}
+    return replace(level, model=replace(model, **changed), state=replace(level.state, **moving), **of_task)
+
+
+@pytest.mark.parametrize("kind", [PolicyKind.ATTENTION, PolicyKind.INVARIANT])
+def test_order_of_entities_does_not_matter(kind: PolicyKind) -> None:
+    levels, policy = levelproof.sample_levels(np.arange(COUNT), "m"), policy_of(kind)
+    other = shuffled(jax.tree.map(np.asarray, levels))
+    logits = np.asarray(jax.jit(policy.logits)(levels, levels.state))
+    assert np.abs(logits).max() > 0.1
+    np.testing.assert_allclose(jax.jit(policy.logits)(other, other.state), logits, atol=2e-4)
+
+
+@pytest.mark.parametrize("size", ["s", "8-0-1-0"])
+def test_attention_plays_any_size_and_idle_entries_are_zero(size: str) -> None:
+    levels, policy = levelproof.sample_levels(np.arange(COUNT), size), policy_of(PolicyKind.ATTENTION)
+    episode = reset(levels)
+    for action in (
+        jax.jit(policy.sample)(jax.random.key(0), levels, episode),
+        jax.jit(policy.most_probable)(levels, levels.state),
+    ):
+        assert action.shape == (6, COUNT)
+        assert not np.asarray(action)[~np.asarray(action_mask(levels))].any()
+
+
+def test_logits_differ_between_levels_and_states_of_a_lane_do_not_touch_others() -> None:
+    levels, policy = levelproof.sample_levels(np.arange(COUNT), "s"), policy_of(PolicyKind.ATTENTION)
+    alone = policy.logits(levels[3], levels[3].state)
+    np.testing.assert_allclose(np.asarray(policy.logits(levels, levels.state))[:, 3:4], alone, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", list(PolicyKind))
+def test_saved_policy_gives_the_same_bits(kind: PolicyKind, tmp_path: Path) -> None:
+    levels, policy = levelproof.sample_levels(np.arange(COUNT), "s"), policy_of(kind)
+    levelproof.save_policy(tmp_path, policy)
+    loaded = levelproof.load_policy(tmp_path)
+    assert (loaded.network, loaded.size, loaded.origin) == (policy.network, policy.size, policy.origin)
+    assert loaded.observation_type == policy.observation_type
+    both = [jax.jit(each.logits)(levels, levels.state) for each in (loaded, policy)]
+    np.testing.assert_array_equal(*both)
+
+
+def test_unusable_policies_are_refused(tmp_path: Path) -> None:
+    policy = policy_of(PolicyKind.FLAT)
+    levelproof.save_policy(tmp_path, policy)
+    levels = levelproof.sample_levels(np.arange(2), "m")
+    with pytest.raises(levelproof.PolicyError, match="size s only, not m"):
+        policy.logits(levels, levels.state)
+    (tmp_path / CONFIG).write_text((tmp_path / CONFIG).read_text().replace('"width": 16', '"width": 17'))
+    with pytest.raises(levelproof.PolicyError, match="damaged"):
+        levelproof.load_policy(tmp_path)
+    (tmp_path / WEIGHTS).unlink()
+    with pytest.raises(levelproof.PolicyError, match="no policy"):
+        levelproof.load_policy(tmp_path)
