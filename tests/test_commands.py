@@ -18,7 +18,12 @@ BUDGETS = {"64k": "3k", "128k": "4k", "256k": "5k", "1M": "6k"}  # budgets on a 
 JOBS = ("generate", "regenerate", "plan")
 ELSEWHERE = ("levelproof play", "://", "HEAD:", "me/levels")  # servers and other hosts, which tests/pipeline tests
 WITH_WORKERS = ("README", "cluster")  # pages whose jobs start Ray; those of other pages run in this process
-NO_MATCH = "No level", "no trajectories", "holds for none"  # errors if a condition fits none of so few levels
+NO_MATCH = (
+    "No level",
+    "no trajectories",
+    "holds for none",
+    "too few levels",
+)  # errors if a condition fits none of so few levels
 
 
 def smaller(line: str) -> list[str]:
@@ -28,6 +33,9 @@ def smaller(line: str) -> list[str]:
     words = [re.sub(r"^levels=.*", f"levels={LEVELS}", word) for word in shlex.split(line, comments=True)[1:]]
     words = words[: words.index(">")] if ">" in words else words  # without a shell's redirection
     unlimited = words[0] == "generate" and not any(word.startswith(("levels=", "level_files=", "-")) for word in words)
+    if words[0] == "clone":
+        words = [word for word in words if not word.startswith("train.")]
+        words += ["train.updates=4", "train.batch=32", "validation=0.5", "where="]
     return words + unlimited * [f"levels={LEVELS}"]
 
 

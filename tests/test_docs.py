@@ -8,9 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import pytest
 
 import levelproof
+from levelproof.experts.networks.over_levels import NetworkConfig, initial_policy
 from levelproof.pipeline.exchange.level_json import export
 from levelproof.pipeline.exchange.parquet import export_parquet
 from levelproof.pipeline.look.gallery.gallery import SITE
@@ -32,12 +34,15 @@ NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder as the README's commands leave it: its split, and levels of it as files."""
+    """Return a folder as the README's commands leave it: its split, levels of it as files, and a policy."""
     folder = tmp_path_factory.mktemp("reader")
     split = played_split(folder / "data")
     assert split == folder / "data/128k/s"
     export(split, int(read_manifest(split).level_ids[0]), folder / "level.json")
     export_parquet(split, None, folder / "levels")
+    network = NetworkConfig()
+    params = initial_policy(jax.random.key(0), network, levelproof.SIZES["s"])
+    levelproof.save_policy(folder / "policy", levelproof.Policy(network, params, None, {}))
     return folder
 
 

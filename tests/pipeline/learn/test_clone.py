@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import is_dataclass
 from pathlib import Path
 
 import jax
@@ -13,13 +14,19 @@ import numpy as np
 import pytest
 
 import levelproof
+from levelproof.configs.clone import CloneConfig
+from levelproof.configs.compose import override_of
+from levelproof.configs.convert import plain
+from levelproof.configs.meanings import comments_in
 from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.imitation import ImitationConfig
+from levelproof.experts.networks.over_levels import NetworkConfig
 from levelproof.levelgen.level import ACTIONS
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.pipeline.learn import clone as module
 from levelproof.pipeline.learn.metrics import STEP
-from tests.pipeline.command import assert_refused, run
+from tests.pipeline.command import ROOT, assert_refused, run
 from tests.pipeline.made import played_split
 
 SETTINGS = ("interval=20", "train.batch=128", "validation=0.3", "where=", "network.width=16", "network.depth=1")
@@ -114,4 +121,13 @@ def test_bad_input_is_refused(split: Path, policy: Path, tmp_path: Path, monkeyp
     first = int(levelproof.open(split).manifest["level_id"][0].as_py())
     monkeypatch.setattr(module, "SEALED", range(first, first + 2))
     with pytest.raises(levelproof.UserError, match="sealed"):
-        module.source_of(split, module.CloneConfig(where=""))
+        module.source_of(split, CloneConfig(where=""))
+
+
+def test_guide_lists_every_setting_with_its_default_and_meaning() -> None:
+    guide = (ROOT / "docs/train.md").read_text()
+    for path, cls in ("", CloneConfig), ("network.", NetworkConfig), ("train.", ImitationConfig):
+        for name, comment in comments_in(cls).items():
+            value = getattr(cls(), name)
+            if not is_dataclass(value):
+                assert f"| `{override_of(path + name, plain(value))}` | {comment.beside} |" in guide
