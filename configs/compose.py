@@ -27,7 +27,8 @@ PACKAGE = "levelproof.configs"  # package of the yaml files
 ConfigStore.instance().store(name="code", node=plain(JobConfig()))  # the defaults that configs/generate.yaml names
 # Entries of JobConfig.results that are not settings, or that are handled separately
 NOT_COPIED = frozenset({"size", "distribution", "budget", "sampler_version"})
-VERBATIM = frozenset({"size", "levels", "level_files", "budget", "out", "continue_from"})  # strings: 007 stays 007
+# Strings: 007 stays 007
+VERBATIM = frozenset({"size", "levels", "level_files", "budget", "out", "continue_from", "where"})
 FOLDERS = ("procedure", "distribution")  # folders of presets
 FOR_RANDOM_LEVELS = ("size", "levels", "first_level", "distribution")
 

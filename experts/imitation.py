@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax.typing import VariableDict
 from jaxtyping import Array, Float, Int
@@ -44,8 +45,8 @@ class Transitions(NamedTuple):
     """Steps of witnesses: levels, what moves in them, and the actions taken."""
 
     level: Level  # lanes last; `state` is None
-    motion: Float[Array, "lane column"]  # MOTION numbers for each body, as `as_motion` lays them out
-    action: Int[Array, "lane 6"]
+    motion: Float[Array | np.ndarray, "lane column"]  # MOTION numbers for each body, as `from_motion` reads them
+    action: Int[Array | np.ndarray, "lane 6"]
 
 
 class Imitation(NamedTuple):
@@ -109,9 +110,9 @@ def _loss(params: VariableDict, seen: Transitions, network: NetworkConfig) -> tu
     return loss, Likeness(loss, right.mean())
 
 
-def from_motion(motion: Float[Array, "lane column"], size: Size) -> State:
+def from_motion(motion: Float[Array | np.ndarray, "lane column"], size: Size) -> State:
     """Return the states, without contacts and impulses, which no network reads."""
-    by_body = motion.reshape(len(motion), size.bodies, MOTION).transpose(1, 2, 0)
+    by_body = jnp.asarray(motion).reshape(len(motion), size.bodies, MOTION).transpose(1, 2, 0)
     return replace(
         zeros_of(State, size, len(motion)),
         position=by_body[:, 0:2],

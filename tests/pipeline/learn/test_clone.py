@@ -107,15 +107,15 @@ def test_splits_of_several_sizes_make_one_policy(split: Path, tmp_path: Path) ->
         levels = levelproof.sample_levels(np.arange(2), size)
         assert jax.jit(policy.logits)(levels, levels.state).shape == (sum(CHOICES), 2)
     done = run(["clone", str(split), str(larger), "network.kind=flat", "where="], tmp_path)
-    assert_refused(done, "levels of one size")
+    assert_refused(done, 2, "levels of one size")
 
 
 def test_bad_input_is_refused(split: Path, policy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert_refused(run(["clone", "train.updates=3"], tmp_path), "no split to clone")
-    assert_refused(run(["clone", str(split), "train.update=3"], tmp_path), "did you mean train.updates?")
-    assert_refused(run(["clone", str(split), "network.width=6"], tmp_path), "multiple of heads")
-    assert_refused(run(["clone", str(split), "-o", str(policy)], tmp_path), "other settings or levels")
-    assert_refused(run(["clone", str(tmp_path / "none")], tmp_path), "none")
+    assert_refused(run(["clone", "train.updates=3"], tmp_path), 2, "no split to clone")
+    assert_refused(run(["clone", str(split), "train.update=3"], tmp_path), 2, "did you mean train.updates?")
+    assert_refused(run(["clone", str(split), "network.width=6"], tmp_path), 2, "multiple of heads")
+    assert_refused(run(["clone", str(split), "-o", str(policy)], tmp_path), 2, "other settings or levels")
+    assert_refused(run(["clone", str(tmp_path / "none")], tmp_path), 2, "none")
     with pytest.raises(levelproof.PolicyError, match="There is no policy in"):
         levelproof.load_policy(tmp_path)
     first = int(levelproof.open(split).manifest["level_id"][0].as_py())
