@@ -100,7 +100,7 @@ def compare(params: VariableDict, seen: Transitions, network: NetworkConfig) -> 
 
 
 def _loss(params: VariableDict, seen: Transitions, network: NetworkConfig) -> tuple[Float[Array, ""], Likeness]:
-    lanes, size, action = len(seen.motion), seen.level.size, seen.action.T
+    lanes, size, action = len(seen.motion), seen.level.size, jnp.asarray(seen.action).T
     state = from_motion(seen.motion, size)
     logits = policy_logits(params, network, replace(seen.level, state=state), state)
     live = jnp.broadcast_to(action_mask(seen.level), (len(action), lanes))

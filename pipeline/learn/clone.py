@@ -25,7 +25,7 @@ from levelproof.pipeline.dataset.subsets import TRAIN, VALIDATION, in_subset
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.learn.metrics import STEP, Metrics
-from levelproof.pipeline.learn.pool import Feed, Source, Transitions, validation_batches
+from levelproof.pipeline.learn.pool import Feed, PartedSplit, Transitions, validation_batches
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.files import write
 from levelproof.pipeline.words import duration, many
@@ -61,7 +61,7 @@ def clone(splits: Sequence[Path], config: CloneConfig, out: Path, console: Conso
     tell(f"The policy is in {out}. Next: levelproof.load_policy({str(out)!r}), as docs/train.md shows.")
 
 
-def source_of(split: Path, config: CloneConfig) -> Source:
+def source_of(split: Path, config: CloneConfig) -> PartedSplit:
     """Open a split, and part its levels. Raise UserError if it is unusable or has sealed levels."""
     data = Dataset(split, config.where or None, (), config.validation)
     ids = data.manifest["level_id"].to_numpy()
@@ -75,10 +75,10 @@ def source_of(split: Path, config: CloneConfig) -> Source:
     train, kept = (np.flatnonzero(in_subset(hashes, part, config.validation)) for part in (TRAIN, VALIDATION))
     if not len(train) or not len(kept):
         raise UserError(f"{split} has too few levels ({len(data)}) for validation={config.validation}: add levels.")
-    return Source(data, train, kept)
+    return PartedSplit(data, train, kept)
 
 
-def size_for(sources: Sequence[Source], config: CloneConfig) -> Size:
+def size_for(sources: Sequence[PartedSplit], config: CloneConfig) -> Size:
     """Return the size that the network is made for. Raise UserError if it fits one and there are several."""
     sizes = list(dict.fromkeys(source.data.size for source in sources))
     if len(sizes) > 1 and config.network.kind is PolicyKind.FLAT:
@@ -88,7 +88,7 @@ def size_for(sources: Sequence[Source], config: CloneConfig) -> Size:
     return sizes[0] if config.network.kind is PolicyKind.FLAT else Size(5, 1, 1, 1)
 
 
-def note_of(sources: Sequence[Source], config: CloneConfig) -> dict[str, Any]:
+def note_of(sources: Sequence[PartedSplit], config: CloneConfig) -> dict[str, Any]:
     """Return what decides a run's result, as JSON."""
     settings = {name: value for name, value in plain(config).items() if name not in WITHOUT_EFFECT}
     splits = [{"split": str(s.data.split), "levels": len(s.data), "ids": s.data.fingerprint} for s in sources]
@@ -127,7 +127,7 @@ def keep(out: Path, state: Imitation, config: CloneConfig, size: Size, note: dic
 
 
 def train(
-    sources: Sequence[Source], config: CloneConfig, out: Path, state: Imitation, metrics: Metrics, console: Console
+    sources: Sequence[PartedSplit], config: CloneConfig, out: Path, state: Imitation, metrics: Metrics, console: Console
 ) -> Imitation:
     """Take the updates that are left; validate, and write a checkpoint, every `config.interval` of them."""
     size, note, last = size_for(sources, config), note_of(sources, config), config.train.updates

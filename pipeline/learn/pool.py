@@ -42,7 +42,7 @@ class LevelPool(NamedTuple):
         return Transitions(level, self.motion[row], self.action[row].astype(np.int32))
 
 
-class Source(NamedTuple):
+class PartedSplit(NamedTuple):
     """The levels of one split that are trained on, and those that are validated on."""
 
     data: Dataset
@@ -86,7 +86,7 @@ def _cut(batch: Batch, whole: bool) -> LevelPool:
 class Feed:
     """The batches of all updates, read and drawn ahead by threads."""
 
-    def __init__(self, sources: Sequence[Source], config: CloneConfig, follow: Callable[[int], None]) -> None:
+    def __init__(self, sources: Sequence[PartedSplit], config: CloneConfig, follow: Callable[[int], None]) -> None:
         self._sources, self._config, self._follow = sources, config, follow
         counts = np.array([len(source.train) for source in sources])
         self._weights = counts / counts.sum()
@@ -131,7 +131,7 @@ class Feed:
         return pool.draw(rng, rng.integers(0, len(pool.steps), self._config.train.batch))
 
 
-def validation_batches(source: Source, config: CloneConfig) -> list[Transitions]:
+def validation_batches(source: PartedSplit, config: CloneConfig) -> list[Transitions]:
     """Return whole batches of transitions of a split's validation levels, the same in every run."""
     rng = np.random.default_rng(config.seed)
     chosen = rng.permutation(source.validation)[:VALIDATED]
