@@ -56,6 +56,7 @@ MAY_IMPORT = {
     "pipeline.play": ("pipeline.look", "pipeline.read", "pipeline.store", "pipeline", *PIPELINE_BELOW),
     "pipeline.jobs": ("pipeline.verify", "pipeline.read", "pipeline.store", "pipeline", *PIPELINE_BELOW),
     "pipeline.learn": (
+        "pipeline.look",
         "pipeline.jobs",
         "pipeline.dataset",
         "pipeline.read",

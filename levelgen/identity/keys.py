@@ -54,6 +54,7 @@ class Stream(IntEnum):
     SEARCH = 4  # exploration of a search
     PORTABILITY = 5  # the perturbed starts from which witnesses are replayed
     SUCCESS_RATE = 6  # attempts of an expert whose training has ended
+    POLICY = 7  # attempts of a policy for all levels, when it is evaluated
 
 
 def level_id_array(level_ids: ArrayLike) -> Int[np.ndarray, " level"]:

@@ -18,8 +18,8 @@ from levelproof.pipeline.urls import require_here, require_known
 from levelproof.pipeline.version import __version__
 
 NAMES = (
-    "generate regenerate settings sample inspect columns plan diff show gallery play clone export import_ card status "
-    "verify seal"
+    "generate regenerate settings sample inspect columns plan diff show gallery play clone evaluate export import_ "
+    "card status verify seal"
 )
 OUTPUTS = ("out", "plot")  # arguments whose paths must be on this machine
 COMMANDS = [import_module(f"levelproof.pipeline.cli.{name}") for name in NAMES.split()]

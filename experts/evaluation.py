@@ -1,0 +1,180 @@
+"""FirstEpisodes of a policy at many levels side by side, and of players that learned nothing.
+
+An attempt's random numbers depend on the level's id, the seed and the attempt's number, not on the lanes beside it, so
+results do not depend on how levels are batched.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.networks.over_levels import NetworkConfig, policy_logits
+from levelproof.experts.policy import most_probable, sample
+from levelproof.levelgen.batching import blocks, repeat, take
+from levelproof.levelgen.identity.keys import Stream, key_for
+from levelproof.levelgen.level import ACTIONS, Level
+from levelproof.levelgen.task import rules as task
+from levelproof.levelgen.task.actions import CHOICES, action_mask
+from levelproof.levelgen.task.rules import TaskParams, TaskState
+
+LANES = 1024  # of a batch
+PART = 16  # env steps between checks whether all attempts have ended
+STAY = 0.9  # chance that sticky random play repeats an entry of the previous action
+
+
+class Moment(NamedTuple):
+    """What a player may know when it acts, lanes last."""
+
+    level: Level
+    now: TaskState
+    previous: Int[Array, "6 lane"]  # the action before; zeros at the start
+    uniform: Float[Array, "6 lane"]  # random numbers in [0, 1), one for each entry
+
+
+Player = Callable[[Any, Moment], Int[Array, "6 lane"]]  # from parameters and a moment to actions
+
+
+class FirstEpisodes(NamedTuple):
+    """First episodes, from the levels' start."""
+
+    solved: Bool[np.ndarray, "level attempt"]
+    env_steps: Int[np.ndarray, "level attempt"]  # until the episode's end
+
+
+def do_nothing(params: Any, moment: Moment) -> Int[Array, "6 lane"]:
+    """Use no actuator."""
+    return jnp.zeros_like(moment.previous)
+
+
+def play_randomly(params: Any, moment: Moment) -> Int[Array, "6 lane"]:
+    """Draw every entry evenly."""
+    return _evenly(moment.uniform)
+
+
+def play_sticky(params: Any, moment: Moment) -> Int[Array, "6 lane"]:
+    """Repeat each entry of the previous action with the chance STAY; else, and at the start, draw it evenly."""
+    fresh = moment.now.timestep == 0
+    left = jnp.where(fresh, moment.uniform, (moment.uniform - STAY) / (1 - STAY))
+    return jnp.where(left >= 0, _evenly(left), moment.previous)
+
+
+def play_sampled(network: NetworkConfig) -> Player:
+    """Return the player that samples from a policy's logits; its parameters are the policy's."""
+    return lambda params, moment: sample(_logits(params, network, moment), moment.uniform)
+
+
+def play_most_probable(network: NetworkConfig) -> Player:
+    """Return the player that takes a policy's most probable choices; its parameters are the policy's."""
+    return lambda params, moment: most_probable(_logits(params, network, moment))
+
+
+def play(
+    player: Player,
+    params: Any,
+    levels: Level,
+    level_ids: Int[np.ndarray, " level"],
+    attempts: int,
+    seed: int,
+    rules: TaskParams,
+    follow: Callable[[int], None] = lambda _: None,
+    lanes: int = LANES,
+) -> FirstEpisodes:
+    """Play `attempts` episodes of each level, each of at most RECORD_STEPS env steps.
+
+    Args:
+        player: chooses actions; a static argument, so pass the same function again.
+        params: the player's parameters.
+        levels: the levels, on the host, level axis last.
+        level_ids: their ids; with the seed and the attempt's number, they decide all randomness.
+        attempts: episodes of a level.
+        seed: 0 or more.
+        rules: the task's rules.
+        follow: is told after every batch how many levels it had.
+        lanes: episodes of a batch; changes no result.
+    """
+    count, program = len(level_ids), _program(player, attempts, rules)
+    parts = []
+    for some in blocks(count, max(1, lanes // attempts)):
+        parts.append(jax.device_get(program(params, take(levels, some), level_ids[some], np.uint32(seed))))
+        follow(len(np.unique(some)))
+    return FirstEpisodes(*(np.concatenate(column)[:count] for column in zip(*parts, strict=True)))
+
+
+class _Playing(NamedTuple):
+    now: TaskState
+    previous: Int[Array, "6 lane"]
+    ended: Bool[Array, " lane"]
+    solved: Bool[Array, " lane"]
+    env_steps: Int[Array, " lane"]
+
+
+def _program(player: Player, attempts: int, rules: TaskParams) -> Callable[..., FirstEpisodes]:
+    """Compile the episodes of a batch of levels."""
+
+    @jax.jit
+    def run(params: Any, levels: Level, level_ids: Int[Array, " level"], seed: Array) -> FirstEpisodes:
+        shape = len(level_ids), attempts
+        keys, level = _keys(level_ids, seed, attempts), repeat(levels, attempts)
+        step = partial(_step, player, params, level, action_mask(level), keys, rules)
+        no = jnp.zeros(shape[0] * shape[1], bool)
+        begun = _Playing(task.reset(level), jnp.zeros((ACTIONS, no.size), jnp.int32), no, no, no.astype(jnp.int32))
+
+        def advance(carry: tuple[Array, _Playing]) -> tuple[Array, _Playing]:
+            first, playing = carry
+            return first + PART, jax.lax.scan(step, playing, first + jnp.arange(PART))[0]
+
+        going = lambda carry: (carry[0] < RECORD_STEPS) & ~carry[1].ended.all()
+        _, after = jax.lax.while_loop(going, advance, (jnp.int32(0), begun))
+        return FirstEpisodes(after.solved.reshape(shape), after.env_steps.reshape(shape))  # pyright: ignore
+
+    return run
+
+
+def _step(
+    player: Player,
+    params: Any,
+    level: Level,
+    live: Bool[Array, "6 lane"],
+    keys: Key[Array, " lane"],
+    rules: TaskParams,
+    playing: _Playing,
+    number: Int[Array, ""],
+) -> tuple[_Playing, None]:
+    """Take env step `number` in every lane; lanes that have ended go on, but no longer count."""
+    draw = lambda key: jax.random.uniform(jax.random.fold_in(key, number), (ACTIONS,))
+    moment = Moment(level, playing.now, playing.previous, jax.vmap(draw, out_axes=-1)(keys))
+    action = jnp.where(live, player(params, moment), 0)
+    now, result = task.advance(level, playing.now, action, rules)
+    after = _Playing(
+        now,
+        action,
+        playing.ended | result.done,
+        playing.solved | (~playing.ended & result.goal),
+        playing.env_steps + ~playing.ended,
+    )
+    return after, None
+
+
+def _keys(level_ids: Int[Array, " level"], seed: Array, attempts: int) -> Key[Array, " lane"]:
+    """Return each attempt's key, the attempts of a level side by side."""
+
+    def of_level(level_id: Array) -> Key[Array, " attempt"]:
+        key = jax.random.fold_in(key_for(level_id, Stream.POLICY), seed)
+        return jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(attempts))
+
+    return jax.vmap(of_level)(level_ids).reshape(-1)
+
+
+def _evenly(uniform: Float[Array, "6 lane"]) -> Int[Array, "6 lane"]:
+    choices = jnp.array(CHOICES)[:, None]
+    return jnp.minimum((uniform * choices).astype(jnp.int32), choices - 1)
+
+
+def _logits(params: Any, network: NetworkConfig, moment: Moment) -> Float[Array, "logit lane"]:
+    return policy_logits(params, network, moment.level, moment.now.state)

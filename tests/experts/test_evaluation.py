@@ -1,0 +1,110 @@
+"""FirstEpisodes at levels: against a plain loop, in other batches, and by baselines."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from levelproof.experts import evaluation
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.evaluation import (
+    STAY,
+    Moment,
+    do_nothing,
+    play,
+    play_most_probable,
+    play_randomly,
+    play_sampled,
+    play_sticky,
+)
+from levelproof.experts.networks.over_levels import NetworkConfig, initial_policy
+from levelproof.levelgen.batching import take
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task import rules as task
+from levelproof.levelgen.task.actions import CHOICES, action_mask
+from levelproof.levelgen.task.rules import DEFAULT_RULES
+
+IDS, ATTEMPTS = np.arange(700, 724), 3
+
+
+@pytest.fixture(scope="module")
+def levels() -> Level:
+    return jax.device_get(sample_levels(IDS, "s"))
+
+
+@pytest.fixture(scope="module")
+def played(levels: Level) -> evaluation.FirstEpisodes:
+    return play(play_randomly, (), levels, IDS, ATTEMPTS, 1, DEFAULT_RULES)
+
+
+def test_attempts_equal_a_plain_loop(levels: Level, played: evaluation.FirstEpisodes) -> None:
+    """One lane, one step at a time, the actions drawn from the same keys."""
+    step = jax.jit(partial(task.advance, params=DEFAULT_RULES))
+    for number, attempt in ((0, 0), (5, 2), (11, 1)):
+        level = take(levels, np.array([number]))
+        key = evaluation._keys(jnp.array([IDS[number]]), jnp.uint32(1), ATTEMPTS)[attempt]
+        now, steps, goal = task.reset(level), 0, False
+        while steps < RECORD_STEPS:
+            uniform = jax.random.uniform(jax.random.fold_in(key, steps), (6,))
+            action = np.floor(np.asarray(uniform) * CHOICES).astype(np.int32)[:, None]
+            now, result = step(level, now, np.where(action_mask(level), action, 0))
+            steps += 1
+            if result.done[0]:
+                goal = bool(result.goal[0])
+                break
+        assert (goal, steps) == (played.solved[number, attempt], played.env_steps[number, attempt])
+
+
+def test_batches_change_no_result(levels: Level, played: evaluation.FirstEpisodes) -> None:
+    order = np.random.default_rng(0).permutation(len(IDS))
+    other = play(play_randomly, (), take(levels, order), IDS[order], ATTEMPTS, 1, DEFAULT_RULES, lanes=8)
+    np.testing.assert_array_equal(other.solved, played.solved[order])
+    np.testing.assert_array_equal(other.env_steps, played.env_steps[order])
+
+
+def test_more_attempts_keep_the_first_ones(levels: Level, played: evaluation.FirstEpisodes) -> None:
+    more = play(play_randomly, (), levels, IDS, ATTEMPTS + 2, 1, DEFAULT_RULES)
+    np.testing.assert_array_equal(more.solved[:, :ATTEMPTS], played.solved)
+    other = play(play_randomly, (), levels, IDS, ATTEMPTS, 2, DEFAULT_RULES)
+    assert (other.env_steps != played.env_steps).any()
+
+
+def test_stored_actions_solve_their_level(levels: Level) -> None:
+    """A player that repeats the actions of a solved attempt solves it in as many steps."""
+    actions = np.zeros((RECORD_STEPS, 6, len(IDS)), np.int32)
+    record = lambda params, moment: params[moment.now.timestep[0], :, jnp.arange(moment.previous.shape[1])].T
+    still = play(do_nothing, (), levels, IDS, 1, 0, DEFAULT_RULES)
+    again = play(record, actions, levels, IDS, 1, 0, DEFAULT_RULES)
+    assert still.solved.any()
+    np.testing.assert_array_equal(again.solved, still.solved)
+
+
+def test_players_draw_as_they_say(levels: Level) -> None:
+    lanes = 24
+    rng = np.random.default_rng(0)
+    before = np.ones((6, lanes), np.int32)
+    start = task.reset(levels)
+    later = jax.tree.map(lambda x: x, start)
+    moment = Moment(levels, later, before, rng.random((6, lanes), np.float32))
+    even = np.asarray(play_randomly((), moment))
+    assert (even >= 0).all()
+    assert (even < np.array(CHOICES)[:, None]).all()
+    np.testing.assert_array_equal(play_sticky((), moment), even)  # nothing to repeat at the start
+    going = moment._replace(now=task.TaskState(start.state, start.timestep + 1, start.last_distance))
+    kept = np.asarray(moment.uniform) < STAY
+    assert (np.asarray(play_sticky((), going))[kept] == 1).all()
+    assert not np.asarray(do_nothing((), moment)).any()
+
+
+def test_policy_plays_by_its_logits(levels: Level) -> None:
+    network = NetworkConfig(width=8, depth=1, heads=2)
+    params = initial_policy(jax.random.key(0), network, SIZES["s"])
+    sampled, greedy = (
+        [play(player, params, levels, IDS, 1, seed, DEFAULT_RULES) for seed in (0, 1)]
+        for player in (play_sampled(network), play_most_probable(network))
+    )
+    assert (sampled[0].env_steps != sampled[1].env_steps).any()
+    np.testing.assert_array_equal(greedy[0].env_steps, greedy[1].env_steps)
