@@ -49,6 +49,7 @@ def shuffled(level: Level) -> Level:
     return replace(level, model=replace(model, **changed), state=replace(level.state, **moving), **of_task)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [PolicyKind.ATTENTION, PolicyKind.INVARIANT])
 def test_order_of_entities_does_not_matter(kind: PolicyKind) -> None:
     levels, policy = levelproof.sample_levels(np.arange(COUNT), "m"), policy_of(kind)
@@ -58,6 +59,7 @@ def test_order_of_entities_does_not_matter(kind: PolicyKind) -> None:
     np.testing.assert_allclose(jax.jit(policy.logits)(other, other.state), logits, atol=2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", ["s", "8-0-1-0"])
 def test_attention_plays_any_size_and_idle_entries_are_zero(size: str) -> None:
     levels, policy = levelproof.sample_levels(np.arange(COUNT), size), policy_of(PolicyKind.ATTENTION)

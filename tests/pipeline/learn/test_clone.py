@@ -26,7 +26,7 @@ from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.pipeline.learn import clone as module
 from levelproof.pipeline.learn.metrics import STEP
-from tests.pipeline.command import ROOT, assert_refused, run
+from tests.pipeline.command import ROOT, assert_refused, here
 from tests.pipeline.made import played_split
 
 SETTINGS = ("interval=20", "train.batch=128", "validation=0.3", "where=", "network.width=16", "network.depth=1")
@@ -34,7 +34,7 @@ SETTINGS = ("interval=20", "train.batch=128", "validation=0.3", "where=", "netwo
 
 def cloned(folder: Path, split: Path, *words: str) -> Path:
     out = folder / "policy"
-    done = run(["clone", str(split), "-o", str(out), *SETTINGS, *words], folder)
+    done = here(["clone", str(split), "-o", str(out), *SETTINGS, *words], folder)
     assert done.returncode == 0, done.stderr
     return out
 
@@ -79,6 +79,7 @@ def test_policy_beats_random_play_on_levels_it_was_trained_on(policy: Path, spli
     assert solve_share(levels, lambda key, world: loaded.sample(key, levels, world)) > random + 0.05
 
 
+@pytest.mark.slow
 def test_run_that_was_killed_continues_bit_for_bit(split: Path, tmp_path: Path) -> None:
     words = ["train.updates=120", "pool=8", "refresh=7"]  # several rounds of levels
     (tmp_path / "whole").mkdir()
@@ -98,6 +99,7 @@ def test_run_that_was_killed_continues_bit_for_bit(split: Path, tmp_path: Path) 
     assert losses[0][-3:] == losses[1][-3:]
 
 
+@pytest.mark.slow
 def test_splits_of_several_sizes_make_one_policy(split: Path, tmp_path: Path) -> None:
     larger = played_split(tmp_path / "larger", size="m")
     out = cloned(tmp_path, split, str(larger), "train.updates=20", "network.kind=invariant", "episodes=all")
@@ -106,16 +108,16 @@ def test_splits_of_several_sizes_make_one_policy(split: Path, tmp_path: Path) ->
     for size in "sm":
         levels = levelproof.sample_levels(np.arange(2), size)
         assert jax.jit(policy.logits)(levels, levels.state).shape == (sum(CHOICES), 2)
-    done = run(["clone", str(split), str(larger), "network.kind=flat", "where="], tmp_path)
+    done = here(["clone", str(split), str(larger), "network.kind=flat", "where="], tmp_path)
     assert_refused(done, 2, "levels of one size")
 
 
 def test_bad_input_is_refused(split: Path, policy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert_refused(run(["clone", "train.updates=3"], tmp_path), 2, "no split to clone")
-    assert_refused(run(["clone", str(split), "train.update=3"], tmp_path), 2, "did you mean train.updates?")
-    assert_refused(run(["clone", str(split), "network.width=6"], tmp_path), 2, "multiple of heads")
-    assert_refused(run(["clone", str(split), "-o", str(policy)], tmp_path), 2, "other settings or levels")
-    assert_refused(run(["clone", str(tmp_path / "none")], tmp_path), 2, "none")
+    assert_refused(here(["clone", "train.updates=3"], tmp_path), 2, "no split to clone")
+    assert_refused(here(["clone", str(split), "train.update=3"], tmp_path), 2, "did you mean train.updates?")
+    assert_refused(here(["clone", str(split), "network.width=6"], tmp_path), 2, "multiple of heads")
+    assert_refused(here(["clone", str(split), "-o", str(policy)], tmp_path), 2, "other settings or levels")
+    assert_refused(here(["clone", str(tmp_path / "none")], tmp_path), 2, "none")
     with pytest.raises(levelproof.PolicyError, match="There is no policy in"):
         levelproof.load_policy(tmp_path)
     first = int(levelproof.open(split).manifest["level_id"][0].as_py())
