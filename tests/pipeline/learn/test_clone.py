@@ -102,7 +102,10 @@ def test_run_that_was_killed_continues_bit_for_bit(split: Path, tmp_path: Path) 
 @pytest.mark.slow
 def test_splits_of_several_sizes_make_one_policy(split: Path, tmp_path: Path) -> None:
     larger = played_split(tmp_path / "larger", size="m")
-    out = cloned(tmp_path, split, str(larger), "train.updates=20", "network.kind=invariant", "episodes=all")
+    out = cloned(
+        tmp_path, split, str(larger), "train.updates=20", "network.kind=invariant", "episodes=all", "log=tensorboard"
+    )
+    assert list((out / "log").glob("*/events*"))
     assert {f"bc/validation_loss/{path}" for path in (split, larger)} <= set(metrics(out)[-1])
     policy = levelproof.load_policy(out)
     for size in "sm":
