@@ -18,12 +18,7 @@ BUDGETS = {"64k": "3k", "128k": "4k", "256k": "5k", "1M": "6k"}  # budgets on a 
 JOBS = ("generate", "regenerate", "plan")
 ELSEWHERE = ("levelproof play", "://", "HEAD:", "me/levels")  # servers and other hosts, which tests/pipeline tests
 WITH_WORKERS = ("README", "cluster")  # pages whose jobs start Ray; those of other pages run in this process
-NO_MATCH = (
-    "No level",
-    "no trajectories",
-    "holds for none",
-    "too few levels",
-)  # errors if a condition fits none of so few levels
+NO_MATCH = "No level", "no trajectories", "holds for none", "too few levels"  # a condition fits none of so few levels
 
 
 def smaller(line: str) -> list[str]:
@@ -36,6 +31,8 @@ def smaller(line: str) -> list[str]:
     if words[0] == "clone":
         words = [word for word in words if not word.startswith("train.")]
         words += ["train.updates=4", "train.batch=32", "validation=0.5", "where="]
+    if words[0] == "evaluate":
+        words += ["--levels", str(LEVELS), "--attempts", "2"]
     return words + unlimited * [f"levels={LEVELS}"]
 
 
@@ -56,7 +53,7 @@ def run_command(words: list[str], folder: Path, inline: bool) -> None:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with what pages presuppose: splits, level files, and a folder in the reference's format."""
+    """Return a folder with what pages presuppose: splits, level files, a policy, a folder in the reference's format."""
     folder = tmp_path_factory.mktemp("docs")
     for size, budget in (("s", "4k"), ("s", "5k"), ("s", "6k"), ("m", "5k"), ("m", "6k")):
         run_command(["generate", f"size={size}", f"budget={budget}", f"levels={LEVELS}"], folder, True)
@@ -64,6 +61,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("mine", "handmade"):
         (folder / name).mkdir()
         shutil.copy(folder / "level.json", folder / name)
+    run_command(smaller("levelproof clone data/4k/s -o policy"), folder, True)
     everything = ["--where", "shard IS NOT NULL"]
     run_command(["export", "data/6k/s", "--format", "kinetix", *everything, "-o", "kinetix/6k/s"], folder, True)
     return folder
@@ -72,8 +70,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=lambda page: page.stem)
 def test_commands_of_a_page_run_in_order(page: Path, made: Path, tmp_path: Path) -> None:
     for words in commands(page):
-        for name in re.findall(r"data/\w+/\w+|kinetix/\w+/\w+|level\.json|\bmine\b|\bhandmade\b", " ".join(words)):
-            makes = words[0] == "import" and f"-o {name}" in " ".join(words)
+        for name in re.findall(
+            r"data/\w+/\w+|kinetix/\w+/\w+|level\.json|\bmine\b|\bhandmade\b|\bpolicy\b", " ".join(words)
+        ):
+            makes = words[0] in ("import", "clone") and f"-o {name}" in " ".join(words)
             if (made / name).exists() and not (tmp_path / name).exists() and not makes:
                 copy = shutil.copytree if (made / name).is_dir() else shutil.copy
                 (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
