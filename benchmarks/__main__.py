@@ -39,6 +39,7 @@ BENCHMARKS = {  # name: (module, what it measures)
     "gallery": ("benchmarks.gallery", "how soon a gallery of many levels appears, and how smoothly it scrolls"),
     "reader": ("benchmarks.reader", "trajectories/s of both readers on the same trajectories"),
     "workers": ("benchmarks.workers", "how much faster two workers are than one, and what a thousand cost the driver"),
+    "cloning": ("benchmarks.cloning", "how cloned policies solve unseen levels, against the number of levels"),
     "readme": ("benchmarks.readme", "the README's commands in a fresh clone and environment"),
 }
 

@@ -57,7 +57,10 @@ def levels_in(place: Path, where: str | None, count: int | None) -> Iterator[Mea
         return
     if where is not None:
         raise UserError(f"--where selects levels of a split, and {place} is none: leave it out.")
-    listing = levels_below(place, JobConfig())
+    try:
+        listing = levels_below(place, JobConfig())
+    except UserError:
+        raise UserError(f"There are no levels at {place}: name a split, a level file or a folder of them.") from None
     if not listing.levels:
         raise UserError(listing.refused[0])
     for size, origins in listing.levels.items():

@@ -60,7 +60,7 @@ def test_command_measures_sealed_levels_without_a_policy(tmp_path: Path) -> None
         (["--where", "label = 'solved'"], "name one with --on"),
         (["--attempts", "0"], "--attempts is 0"),
         (["--size", "huge"], "set --size to s, m or l"),
-        (["--on", "nowhere"], "nowhere"),
+        (["--on", "nowhere"], "There are no levels at nowhere"),
     ],
 )
 def test_command_refuses(tmp_path: Path, words: list[str], sentence: str) -> None:

@@ -1,0 +1,26 @@
+"""The benchmark of cloning, on a split of a few levels."""
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.__main__ import parser
+from benchmarks.cloning import run
+from levelproof.pipeline.store.manifest import require_manifest
+from tests.pipeline.made import played_split
+
+pytestmark = pytest.mark.campaign
+
+
+def test_cloning_measures_policies_and_keeps_them(tmp_path: Path) -> None:
+    split = played_split(tmp_path / "data")
+    solved = require_manifest(split, ["label"]).table["label"].to_pylist().count("solved")
+    words = ["cloning", str(split), "--levels", str(solved), "--seeds", "1", "--updates", "2", "--measured", "8"]
+    args = parser("cloning").parse_args([*words, "--folder", str(tmp_path / "kept")])
+    first = run(args)
+    assert first.tables[0].rows[0][0] == str(solved)
+    assert len(first.tables[1].rows) == 3
+    policy = tmp_path / f"kept/{solved}-0/policy.safetensors"
+    before = policy.stat().st_mtime_ns
+    assert run(args).results == first.results
+    assert policy.stat().st_mtime_ns == before
