@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from levelproof.experts.networks.over_levels import NetworkConfig, initial_policy, policy_logits
 from levelproof.experts.policy import log_probability, most_probable
+from levelproof.levelgen.identity.keys import key_of_seed
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.actions import action_mask
 from levelproof.physics.bounds import require
@@ -75,7 +76,7 @@ def optimiser_of(config: ImitationConfig) -> optax.GradientTransformation:
 @partial(jax.jit, static_argnames=("network", "size", "config"))
 def begin_imitation(seed: Int[Array, ""], network: NetworkConfig, size: Size, config: ImitationConfig) -> Imitation:
     """Initialise a policy; `size` is that of the levels if the network fits one size only."""
-    params = initial_policy(jax.random.key(seed), network, size)
+    params = initial_policy(key_of_seed(seed), network, size)
     return Imitation(params, optimiser_of(config).init(params), params, jnp.int32(0))
 
 

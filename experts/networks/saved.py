@@ -17,6 +17,7 @@ from safetensors.numpy import load_file, save
 
 from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy, policy_logits
 from levelproof.experts.policy import most_probable, sample
+from levelproof.levelgen.identity.keys import key_of_seed
 from levelproof.levelgen.level import ACTIONS, Level, name_of, size_of
 from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.environment import ObservationType
@@ -111,7 +112,7 @@ def load_policy(folder: str | os.PathLike[str]) -> Policy:
         shape = config["network"]
         network = NetworkConfig(**shape | {"kind": PolicyKind(shape["kind"])})
         size = None if config["size"] is None else size_of(config["size"])
-        wanted = jax.eval_shape(lambda: initial_policy(jax.random.key(0), network, size or size_of("m")))
+        wanted = jax.eval_shape(lambda: initial_policy(key_of_seed(0), network, size or size_of("m")))
         params = unnamed(wanted, load_file(path / WEIGHTS))
     except FileNotFoundError:
         raise PolicyError(f"There is no policy in {path}: `levelproof clone SPLIT -o {path}` makes one.") from None

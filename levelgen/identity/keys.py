@@ -17,6 +17,7 @@ from jaxtyping import Array, Int, Key
 from numpy.typing import ArrayLike
 
 SAMPLER_VERSION = 1  # increment when a change gives an id another level or other random streams
+SEEDS = 0x5EED  # what keys of seeds fold in the place of the sampler's version
 ROOT_KEY = (0, 0)  # as words, not as a seed, to which JAX would add `jax_random_seed_offset`
 MAX_LEVEL_ID = 2**31 - 1  # fits into 32 bits, signed or unsigned
 
@@ -76,6 +77,14 @@ def key_for(level_id: Int[Array, ""] | int, stream: Stream) -> Key[Array, ""]:
 
     `level_id` is 0 .. MAX_LEVEL_ID; it may be traced, and mapped with `jax.vmap`.
     """
-    root = jax.random.wrap_key_data(jnp.array(ROOT_KEY, jnp.uint32), impl=GENERATOR)
-    level_key = jax.random.fold_in(jax.random.fold_in(root, SAMPLER_VERSION), level_id)
+    level_key = jax.random.fold_in(jax.random.fold_in(_root(), SAMPLER_VERSION), level_id)
     return jax.random.fold_in(level_key, int(stream))
+
+
+def key_of_seed(seed: Int[Array, ""] | int) -> Key[Array, ""]:
+    """Return a key that belongs to no level, such as that of a network's initial weights; `seed` is 0 or more."""
+    return jax.random.fold_in(jax.random.fold_in(_root(), SEEDS), seed)
+
+
+def _root() -> Key[Array, ""]:
+    return jax.random.wrap_key_data(jnp.array(ROOT_KEY, jnp.uint32), impl=GENERATOR)

@@ -99,6 +99,7 @@ def test_players_draw_as_they_say(levels: Level) -> None:
     assert not np.asarray(do_nothing((), moment)).any()
 
 
+@pytest.mark.campaign
 def test_policy_plays_by_its_logits(levels: Level) -> None:
     network = NetworkConfig(width=8, depth=1, heads=2)
     params = initial_policy(jax.random.key(0), network, SIZES["s"])

@@ -90,7 +90,7 @@ def test_connected_explains_a_ray_that_starts_too_slowly(kind: type, monkeypatch
         pass
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_workers_do_without_a_gpu_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setenv("RAY_OVERRIDE_RESOURCES", '{"GPU": 1}')
@@ -213,7 +213,7 @@ cluster.run(job, Path("data"), scheduler, settle, board, Stop())
 """
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_worker_uses_the_cpu_where_jax_prefers_a_gpu() -> None:
     done = python(ON_WHAT, JAX_PLATFORMS="cuda,cpu")
     assert done.stderr.splitlines()[-1] == "cpu ['cpu']", done.stderr

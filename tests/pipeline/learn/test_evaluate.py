@@ -10,11 +10,11 @@ from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, i
 from levelproof.experts.networks.saved import Policy, save_policy
 from levelproof.levelgen.level import size_of
 from levelproof.pipeline.learn.solve_rates import interval, solve_rates
-from tests.pipeline.command import assert_refused, run
+from tests.pipeline.command import assert_refused, here, run
 
 
 def facts(folder: Path, *words: str) -> dict:
-    done = run(["evaluate", *words, "--json"], folder)
+    done = here(["evaluate", *words, "--json"], folder)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
@@ -64,12 +64,12 @@ def test_command_measures_sealed_levels_without_a_policy(tmp_path: Path) -> None
     ],
 )
 def test_command_refuses(tmp_path: Path, words: list[str], sentence: str) -> None:
-    assert_refused(run(["evaluate", *words], tmp_path), 2, sentence)
+    assert_refused(here(["evaluate", *words], tmp_path), 2, sentence)
 
 
 def test_command_refuses_a_policy_of_another_size(tmp_path: Path) -> None:
     policy = policy_in(tmp_path, PolicyKind.FLAT, "m")
-    assert_refused(run(["evaluate", str(policy), "--levels", "8"], tmp_path), 2, "plays levels of size m only")
+    assert_refused(here(["evaluate", str(policy), "--levels", "8"], tmp_path), 2, "plays levels of size m only")
 
 
 def test_intervals_are_over_levels() -> None:
