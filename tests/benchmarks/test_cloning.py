@@ -20,7 +20,7 @@ def test_cloning_measures_policies_and_keeps_them(tmp_path: Path) -> None:
     first = run(args)
     assert first.tables[0].rows[0][0] == str(solved)
     assert len(first.tables[1].rows) == 3
-    policy = tmp_path / f"kept/{solved}-0/policy.safetensors"
-    before = policy.stat().st_mtime_ns
+    kept = [tmp_path / f"kept/{solved}-0" / name for name in ("sealed.json", "seen.json")]
+    before = [file.stat().st_mtime_ns for file in kept]
     assert run(args).results == first.results
-    assert policy.stat().st_mtime_ns == before
+    assert [file.stat().st_mtime_ns for file in kept] == before
