@@ -94,8 +94,11 @@ def save_policy(folder: str | os.PathLike[str], policy: Policy) -> None:
     config = {"format": FORMAT, "network": asdict(policy.network), "size": size, "origin": dict(policy.origin)}
     arrays = {name: np.ascontiguousarray(x) for name, x in named(policy.params).items()}
     for name, content in (WEIGHTS, save(arrays)), (CONFIG, (json.dumps(config, indent=2) + "\n").encode()):
-        (path / f"{name}.tmp").write_bytes(content)
-        (path / f"{name}.tmp").replace(path / name)
+        temporary = path / f"{name}.tmp"
+        temporary.unlink(missing_ok=True)  # what a killed process left, or a link to someone's file
+        with temporary.open("xb") as file:
+            file.write(content)
+        temporary.replace(path / name)
 
 
 def load_policy(folder: str | os.PathLike[str]) -> Policy:

@@ -101,3 +101,14 @@ def test_unusable_policies_are_refused(tmp_path: Path) -> None:
     (tmp_path / WEIGHTS).unlink()
     with pytest.raises(levelproof.PolicyError, match="no policy"):
         levelproof.load_policy(tmp_path)
+
+
+def test_saving_leaves_alone_what_a_link_in_the_folder_points_to(tmp_path: Path) -> None:
+    (tmp_path / "profile").write_text("mine")
+    (tmp_path / "policy").mkdir()
+    for name in (WEIGHTS, CONFIG):
+        (tmp_path / f"policy/{name}.tmp").symlink_to(tmp_path / "profile")
+        (tmp_path / "policy" / name).symlink_to(tmp_path / "profile")
+    levelproof.save_policy(tmp_path / "policy", policy_of(PolicyKind.FLAT))
+    assert (tmp_path / "profile").read_text() == "mine"
+    assert levelproof.load_policy(tmp_path / "policy").size is not None
