@@ -24,13 +24,13 @@ from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.dataset.subsets import TRAIN, VALIDATION, in_subset
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs.progress import say
+from levelproof.pipeline.learn.measured import SEALED
 from levelproof.pipeline.learn.metrics import STEP, Metrics
 from levelproof.pipeline.learn.pool import Feed, PartedSplit, Transitions, validation_batches
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.files import write
 from levelproof.pipeline.words import duration, many
 
-SEALED = range(2_000_000_000, 2_000_002_048)  # ids of the levels that policies are measured on
 CHECKPOINT, RUN = "checkpoint.safetensors", "run.json"
 WITHOUT_EFFECT = ("log",)  # settings that a continued run may change
 

@@ -4,6 +4,7 @@ import json
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ from levelproof.experts.evaluation import (
 from levelproof.experts.networks.saved import Policy, PolicyError, load_policy
 from levelproof.levelgen.level import name_of
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.learn.measured import MeasuredLevels, levels_in, sealed_levels
 from levelproof.pipeline.learn.solve_rates import Solved, solve_rates
 from levelproof.pipeline.runtime import prepare_jax
@@ -62,8 +64,9 @@ def evaluate(
     prepare_jax()
     loaded = _loaded(policy) if policy else None
     entrants = _entrants(loaded)
-    groups = levels_in(place, where, count) if place else (sealed_levels(size, count) for size in sizes)
     console = Console(stderr=True)
+    sealed = (sealed_levels(size, count) for size in dict.fromkeys(sizes))
+    groups = levels_in(place, where, count, partial(say, console)) if place else sealed
     facts = []
     for group in groups:
         _require_size(loaded, group)

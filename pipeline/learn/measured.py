@@ -1,6 +1,6 @@
 """The levels that a policy is measured on: of a split, of level files, or sealed ones."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,12 +13,13 @@ from levelproof.levelgen.level import Level, name_of, size_of
 from levelproof.levelgen.sampling.sampler import check_size, sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.learn.clone import SEALED
 from levelproof.pipeline.read.level_files import levels_at, levels_below
 from levelproof.pipeline.read.levels import COLUMNS, levels_of, rules_of
 from levelproof.pipeline.read.select import columns_in, select
 from levelproof.pipeline.store.manifest import fragment_paths, require_manifest
 from levelproof.pipeline.store.remote import is_remote
+
+SEALED = range(2_000_000_000, 2_000_002_048)  # ids of the levels that policies are measured on, and never trained
 
 
 class MeasuredLevels(NamedTuple):
@@ -45,8 +46,12 @@ def sealed_levels(size: str, count: int | None) -> MeasuredLevels:
     return MeasuredLevels(f"sealed {size}", ids, sample_levels(ids, size), DEFAULT_RULES, None)
 
 
-def levels_in(place: Path, where: str | None, count: int | None) -> Iterator[MeasuredLevels]:
+def levels_in(
+    place: Path, where: str | None, count: int | None, say: Callable[[str], None]
+) -> Iterator[MeasuredLevels]:
     """Yield the levels of a split, or of the level files in a folder, by size; of each the first `count`.
+
+    Calls `say` with a sentence for each level file that is left out.
 
     Raises:
         UserError: there is no split and no usable level file, or no level meets the condition.
@@ -63,6 +68,8 @@ def levels_in(place: Path, where: str | None, count: int | None) -> Iterator[Mea
         raise UserError(f"There are no levels at {place}: name a split, a level file or a folder of them.") from None
     if not listing.levels:
         raise UserError(listing.refused[0])
+    for sentence in (*listing.copies, *listing.refused):
+        say(sentence)
     for size, origins in listing.levels.items():
         ids = np.array([*origins][:count])
         levels = levels_at([origins[level_id] for level_id in ids.tolist()])
@@ -77,6 +84,6 @@ def _of_split(split: Path, where: str | None, count: int | None) -> MeasuredLeve
             f"{split} has no level that meets the condition: `levelproof inspect {split}` shows its levels."
         )
     levels, labels = levels_of(manifest, rows), rows["label"].to_pylist()
-    solvable = np.array([label == Label.SOLVED for label in labels])
+    solved = np.array([label == Label.SOLVED for label in labels])
     name = f"{split}, {name_of(levels.size)}"
-    return MeasuredLevels(name, rows["level_id"].to_numpy(), levels, rules_of(manifest), solvable)
+    return MeasuredLevels(name, rows["level_id"].to_numpy(), levels, rules_of(manifest), solved)

@@ -9,7 +9,9 @@ import pytest
 from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy
 from levelproof.experts.networks.saved import Policy, save_policy
 from levelproof.levelgen.level import size_of
+from levelproof.pipeline.exchange.level_json import export
 from levelproof.pipeline.learn.solve_rates import interval, solve_rates
+from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.command import assert_refused, here, run
 
 
@@ -51,6 +53,18 @@ def test_command_measures_sealed_levels_without_a_policy(tmp_path: Path) -> None
     assert group["levels"] == "sealed s"
     assert group["of"]["all"]["random"]["levels"] == 16
     assert group["of"]["all"]["random"]["worst"] is None
+
+
+def test_command_names_level_files_that_it_leaves_out(split: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    export(split, int(read_manifest(split).level_ids[0]), folder / "good.json")
+    (folder / "damaged.json").write_text("{")
+    done = here(["evaluate", "--on", "mine", "--attempts", "1", "--json"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "damaged.json" in done.stderr
+    (group,) = json.loads(done.stdout)["levels"]
+    assert group["of"]["all"]["random"]["levels"] == 1
 
 
 @pytest.mark.parametrize(
