@@ -38,3 +38,8 @@ class Failure(LevelproofError):
 
 class StoreFailure(LevelproofError):
     """A store does not answer, or rejects a request. Not a `Failure`, which readers take for damaged data."""
+
+
+def last_line(error: Exception) -> str:
+    """Return the last line of a library's message, without its full stop; its type's name if it has no message."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[-1].rstrip(".")

@@ -30,7 +30,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy, Place
 
 from levelproof.configs.schema import JobConfig
 from levelproof.levelgen.level import size_of
-from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.errors import Failure, last_line
 from levelproof.pipeline.jobs.address import cannot_start, ray_address, require_reachable
 from levelproof.pipeline.jobs.likeness import Program, mismatch, program_of, with_absolute_paths
 from levelproof.pipeline.jobs.places import bytes_of_worker, memory_to_reserve, shortage, workers_by_machine
@@ -389,7 +389,7 @@ def _why_no_gpu() -> str:
         probe = ray.remote(num_cpus=0, num_gpus=1, max_calls=1, scheduling_strategy=strategy)(jax_sees_a_gpu)
         return "" if ray.get(probe.remote(), timeout=PROBE_PATIENCE) else NO_GPU
     except RayError as error:  # also after the time-out
-        return f"the cluster has one, but no answer came from it ({str(error).strip().splitlines()[-1].rstrip('.')})"
+        return f"the cluster has one, but no answer came from it ({last_line(error)})"
     finally:
         remove_placement_group(group)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from levelproof.configs.schema import JobConfig
-from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.errors import UserError, last_line
 from levelproof.pipeline.store.event_files import Event
 from levelproof.pipeline.store.remote import is_remote
 
@@ -44,40 +44,56 @@ def logged(job: JobConfig, split: Path, say: Callable[[str], None]) -> Iterator[
 
     If the library or the disk fails, the user is told once, and the run continues without a log.
     """
-    writer: ScalarWriter | None = None
-    done = False
+    log, done = GuardedLog(job.log, say), False
 
-    @contextmanager
-    def harmless() -> Iterator[None]:
-        nonlocal writer
-        try:
-            yield
-        except Exception as error:  # libraries raise types of their own
-            writer, reason = None, (str(error).strip().splitlines() or [type(error).__name__])[-1].rstrip(".")
-            say(f"Cannot log to {job.log} ({reason}): the run continues without a log.")
+    def opened() -> ScalarWriter:
+        # Object stores cannot append to files
+        folder = Path(FOLDER, *split.parts[-2:]) if is_remote(split) else split / FOLDER
+        if not is_remote(split) and folder.is_symlink():
+            raise UserError(f"{folder} is a link, but a split's folders must lie inside it")
+        return writer_of(job.log, folder, "levels/committed", f"{job.budget}/{job.size}", job.results)
 
     def take(events: Sequence[Event]) -> None:
         nonlocal done
         done = events[-1].get("how") == "done"
-        if writer:
-            with harmless():
-                writer.write(scalars(events[0], events[-1]))
+        log.use(lambda writer: writer.write(scalars(events[0], events[-1])))
 
     if job.log != "none":
-        # Object stores cannot append to files
-        folder = Path(FOLDER, *split.parts[-2:]) if is_remote(split) else split / FOLDER
-        with harmless():
-            if not is_remote(split) and folder.is_symlink():
-                raise UserError(f"{folder} is a link, but a split's folders must lie inside it")
-            opened = writer_of(job.log, folder, "levels/committed", f"{job.budget}/{job.size}", job.results)
-            say(f"Scalars for {job.log}: {opened.place}")
-            writer = opened
+        log.open(opened)
     try:
         yield take
     finally:
-        if writer:
-            with harmless():
-                writer.close(done)
+        log.use(lambda writer: writer.close(done))
+
+
+class GuardedLog:
+    """A logging library's writer whose failure ends no run: the user is told once, and nothing more is logged."""
+
+    def __init__(self, log: str, say: Callable[[str], None]) -> None:
+        """Begin without a writer; `log` is the setting, for messages."""
+        self._log, self._say = log, say
+        self._writer: ScalarWriter | None = None
+
+    def open(self, make: Callable[[], ScalarWriter]) -> None:
+        """Open the writer that `make` returns, and say where its scalars are."""
+        with self._guarded():
+            writer = make()
+            self._say(f"Scalars for {self._log}: {writer.place}")
+            self._writer = writer
+
+    def use(self, act: Callable[[ScalarWriter], None]) -> None:
+        """Call `act` with the writer, if there still is one."""
+        if writer := self._writer:
+            with self._guarded():
+                act(writer)
+
+    @contextmanager
+    def _guarded(self) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:  # libraries raise types of their own
+            self._writer = None
+            self._say(f"Cannot log to {self._log} ({last_line(error)}): the run continues without a log.")
 
 
 def writer_of(log: str, folder: Path, step: str, name: str, settings: Mapping[str, Any]) -> ScalarWriter:
