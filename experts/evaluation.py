@@ -1,4 +1,4 @@
-"""FirstEpisodes of a policy at many levels side by side, and of players that learned nothing.
+"""First episodes of a policy on many levels side by side, and of players that learned nothing.
 
 An attempt's random numbers depend on the level's id, the seed and the attempt's number, not on the lanes beside it, so
 results do not depend on how levels are batched.

@@ -1,4 +1,4 @@
-"""FirstEpisodes at levels: against a plain loop, in other batches, and by baselines."""
+"""First episodes on levels: against a plain loop, in other batches, and by baselines."""
 
 from functools import partial
 
@@ -72,14 +72,18 @@ def test_more_attempts_keep_the_first_ones(levels: Level, played: evaluation.Fir
     assert (other.env_steps != played.env_steps).any()
 
 
-def test_stored_actions_solve_their_level(levels: Level) -> None:
-    """A player that repeats the actions of a solved attempt solves it in as many steps."""
-    actions = np.zeros((RECORD_STEPS, 6, len(IDS)), np.int32)
-    record = lambda params, moment: params[moment.now.timestep[0], :, jnp.arange(moment.previous.shape[1])].T
+def test_stored_actions_solve_their_level(levels: Level, played: evaluation.FirstEpisodes) -> None:
+    """A player that repeats the actions of random play's first attempts solves as much, in as many steps."""
+    keys = evaluation._keys(jnp.array(IDS), jnp.uint32(1), ATTEMPTS)[::ATTEMPTS]
+    draw = lambda key, step: jax.random.uniform(jax.random.fold_in(key, step), (6,))
+    uniform = jax.vmap(jax.vmap(draw, (0, None), -1), (None, 0))(keys, jnp.arange(RECORD_STEPS))
+    actions = np.floor(np.asarray(uniform) * np.array(CHOICES)[:, None]).astype(np.int32)
+    record = lambda params, moment: params[moment.now.timestep[0]]
+    again = play(record, actions, levels, IDS, 1, 0, DEFAULT_RULES, lanes=len(IDS))
+    np.testing.assert_array_equal(again.solved[:, 0], played.solved[:, 0])
+    np.testing.assert_array_equal(again.env_steps[:, 0], played.env_steps[:, 0])
     still = play(do_nothing, (), levels, IDS, 1, 0, DEFAULT_RULES)
-    again = play(record, actions, levels, IDS, 1, 0, DEFAULT_RULES)
-    assert still.solved.any()
-    np.testing.assert_array_equal(again.solved, still.solved)
+    assert (again.solved & ~still.solved).any()  # the actions matter
 
 
 def test_players_draw_as_they_say(levels: Level) -> None:
@@ -87,8 +91,7 @@ def test_players_draw_as_they_say(levels: Level) -> None:
     rng = np.random.default_rng(0)
     before = np.ones((6, lanes), np.int32)
     start = task.reset(levels)
-    later = jax.tree.map(lambda x: x, start)
-    moment = Moment(levels, later, before, rng.random((6, lanes), np.float32))
+    moment = Moment(levels, start, before, rng.random((6, lanes), np.float32))
     even = np.asarray(play_randomly((), moment))
     assert (even >= 0).all()
     assert (even < np.array(CHOICES)[:, None]).all()
