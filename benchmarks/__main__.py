@@ -26,6 +26,7 @@ BENCHMARKS = {  # name: (module, what it measures)
     "floor": ("benchmarks.floor", "what each stage of a physics step costs, and the floor of its arithmetic"),
     "scaling": ("benchmarks.scaling", "env steps/s against active contacts, and against bodies"),
     "observation": ("benchmarks.observation", "what the symbolic-flat observation costs beside the step"),
+    "fresh": ("benchmarks.fresh", "random play on new levels at every reset, against a table of levels"),
     "cores": ("benchmarks.cores", "how much faster one process steps on all cores than on one"),
     "families": ("benchmarks.families", "how many levels of each distribution need no expert, and a sheet of each"),
     "portability": ("benchmarks.portability", "how many witnesses reach the goal in the reference"),
@@ -40,6 +41,7 @@ BENCHMARKS = {  # name: (module, what it measures)
     "reader": ("benchmarks.reader", "trajectories/s of both readers on the same trajectories"),
     "workers": ("benchmarks.workers", "how much faster two workers are than one, and what a thousand cost the driver"),
     "cloning": ("benchmarks.cloning", "how cloned policies solve unseen levels, against the number of levels"),
+    "cold": ("benchmarks.cold", "how long the first levels take with nothing compiled, and the next ones"),
     "readme": ("benchmarks.readme", "the README's commands in a fresh clone and environment"),
 }
 

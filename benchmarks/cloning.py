@@ -1,7 +1,7 @@
 """How well cloned policies solve levels they have never seen, against the number of levels they were cloned from.
 
-Policies of all numbers of levels see equally many transitions. A run that was stopped continues: `levelproof clone`
-continues from its checkpoint, and finished evaluations are kept in the folder.
+All policies see equally many transitions, whatever their number of levels. A stopped run resumes: `levelproof clone`
+resumes from its checkpoint, and the folder keeps finished evaluations.
 """
 
 import argparse
@@ -26,7 +26,7 @@ POLICY, BASELINES = ("policy, sampled", "policy, greedy"), ("doing nothing", "ra
 def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("split", type=Path, help="split to clone from, with enough solved levels")
     parser.add_argument("--levels", type=int, nargs="+", default=LEVELS, help="solved levels to clone from")
-    parser.add_argument("--seeds", type=int, default=SEEDS, help=f"policies of each number (default: {SEEDS})")
+    parser.add_argument("--seeds", type=int, default=SEEDS, help=f"policies per number of levels (default: {SEEDS})")
     parser.add_argument("--updates", type=int, default=UPDATES, help=f"updates of each policy (default: {UPDATES})")
     parser.add_argument("--measured", type=int, default=2048, help="sealed levels to measure on (default: 2048)")
     parser.add_argument("--folder", type=Path, default=Path("cloning"), help="where policies are kept")
@@ -76,7 +76,7 @@ def kept(file: Path, *words: Any) -> dict[str, Any]:
 
 
 def command(*words: Any) -> str:
-    """Run a command; return its output. Raise Failure with what it says if it fails."""
+    """Run a command; return its output. Raise Failure with the last line of its errors if it fails."""
     done = subprocess.run(
         [sys.executable, "-m", "levelproof", *map(str, words)], capture_output=True, text=True, check=False
     )

@@ -63,14 +63,14 @@ def measured(size: str, count: int, repeats: int) -> dict[str, Any]:
 
 
 def _program(lanes: Lanes, params: Any, cores: int) -> tuple[Any, tuple]:
-    """Compile a rollout, its lanes divided among cores where there are several; return it with its inputs."""
+    """Compile a rollout, with its lanes divided among the cores if there are several; return it with its inputs."""
     total = LANES_PER_CORE * cores
     table = jax.jit(lanes.table)(params)
     _, state, played = jax.jit(lanes.reset)(table, jnp.arange(total) % LEVELS)
     coming = jax.random.randint(jax.random.key(0), (STEPS, total), 0, LEVELS)
     inputs = table, played, state, jnp.asarray(sticky_actions(STEPS, total)), coming
     rollout = lambda *inputs: lanes_rollout(lanes, *inputs)[0]
-    if cores == 1:  # what a caller runs who does not divide anything
+    if cores == 1:  # as a caller runs it who does not divide the lanes
         return jax.jit(rollout).lower(*inputs).compile(), inputs
     mesh = jax.make_mesh((cores,), ("core",), axis_types=(AxisType.Auto,), devices=jax.devices()[:cores])
     lanes_last = partial(jax.tree.map, lambda x: PartitionSpec(*[None] * (x.ndim - 1), "core"))

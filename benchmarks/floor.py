@@ -77,9 +77,9 @@ def count(inputs: Inputs, stages: tuple) -> Counter:
     scratch = jax.tree.map(lambda buffer: np.zeros(buffer.array().shape, buffer.dtype), buffers_of(Scratch, size))
     for first in range(0, COUNTED, LANES):
         block_inputs = jax.tree.map(lambda x, at=first: np.array(x[..., at : at + LANES]), inputs)
-        handed = block_inputs, table, jax.tree.map(np.zeros_like, block_inputs.before), scratch
-        closed = jax.make_jaxpr(kernel)(*handed)
-        interpret(closed.jaxpr, [np.array(x) for x in (*closed.consts, *jax.tree.leaves(handed))], total)
+        arguments = block_inputs, table, jax.tree.map(np.zeros_like, block_inputs.before), scratch
+        closed = jax.make_jaxpr(kernel)(*arguments)
+        interpret(closed.jaxpr, [np.array(x) for x in (*closed.consts, *jax.tree.leaves(arguments))], total)
     return Counter({what: n * LANES // COUNTED for what, n in total.items()})
 
 

@@ -11,12 +11,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks.endless import endless_queue, update_slots
+from benchmarks.endless import endless_slots, update_slots
 from benchmarks.report import Report, Table
 from levelproof.experts.config import ExpertConfig, Network
 from levelproof.experts.networks.entity import KINDS
 from levelproof.experts.networks.layers import LOGITS
-from levelproof.experts.training.slots import empty_slots
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.observe.flat import DYNAMIC_ROWS
@@ -58,13 +57,13 @@ def multiply_adds(name: str, size: Size) -> int:
 
 def ready(size: Size, config: ExpertConfig):
     """Train UPDATES updates; return a function that trains as many more."""
-    queue = endless_queue(jax.device_get(sample_levels(np.arange(SLOTS), size)), config)
-    slots = empty_slots(SLOTS, queue, config)
+    ids = np.arange(SLOTS)
+    slots = endless_slots(jax.device_get(sample_levels(ids, size)), ids, config)
 
     def train() -> None:
         nonlocal slots
         for _ in range(UPDATES):
-            slots, _ = update_slots(slots, queue, config)
+            slots, _ = update_slots(slots, config)
         jax.block_until_ready(slots)
 
     train()

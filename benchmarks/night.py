@@ -30,7 +30,7 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", default="s")
     parser.add_argument("--budget", default="64k")
     parser.add_argument("--out", type=Path, help="folder to keep the split in (default: it is deleted)")
-    parser.add_argument("--every", type=float, default=INTERVAL, metavar="SECONDS", help="between samples of memory")
+    parser.add_argument("--every", type=float, default=INTERVAL, metavar="SECONDS", help="time between memory samples")
 
 
 def run(args: argparse.Namespace) -> Report:
@@ -108,29 +108,29 @@ def _timed(arguments: Sequence[str], samples: list[dict[str, Any]], every: float
 def memory_of(driver: int) -> dict[str, int]:
     """Return the RAM of a command, of its workers and of its other descendants, bytes; shared pages are divided."""
     memory = {"driver": _memory(driver), "workers": 0, "ray": 0, "worker_count": 0}
-    for pid in _below(driver):
-        title = _read(pid, "cmdline").replace("\0", " ")
+    for pid in below(driver):
+        title = process_file(pid, "cmdline").replace("\0", " ")
         is_worker = title.startswith("ray::WorkerActor")
         memory["workers" if is_worker else "ray"] += _memory(pid)
         memory["worker_count"] += is_worker
     return memory
 
 
-def _below(pid: int) -> list[int]:
+def below(pid: int) -> list[int]:
     """List all descendants of a process."""
     tasks = Path(f"/proc/{pid}/task").glob("*")
     children = [int(child) for task in tasks for child in _read_path(task / "children").split()]
-    return [below for child in children for below in (child, *_below(child))]
+    return [pid for child in children for pid in (child, *below(child))]
 
 
 def _memory(pid: int) -> int:
-    for line in _read(pid, "smaps_rollup").splitlines():
+    for line in process_file(pid, "smaps_rollup").splitlines():
         if line.startswith("Pss:"):
             return int(line.split()[1]) * 1024
     return 0
 
 
-def _read(pid: int, name: str) -> str:
+def process_file(pid: int, name: str) -> str:
     return _read_path(Path(f"/proc/{pid}/{name}"))
 
 

@@ -23,7 +23,7 @@ from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.runtime import prepare_jax
 
-FIRST = 1_000_000  # level id: nothing was tuned on levels from there on
+FIRST = 1_000_000  # first level id; nothing was tuned on this level or later ones
 LEVELS = {"s": 64, "m": 64, "l": 32}
 BUDGET = 256_000  # env steps of an expert
 POLISH = (16_384, 65_536, 262_144)  # env steps per witness
@@ -31,7 +31,7 @@ POLISH = (16_384, 65_536, 262_144)  # env steps per witness
 
 @dataclass(frozen=True)
 class Lengths:
-    """Env steps to the goal on levels that both procedures solve, the masters by an expert's own witness."""
+    """Env steps to the goal on levels that both procedures solve; masters must do so by an expert's own witness."""
 
     default: Int[np.ndarray, " level"]
     polished: Int[np.ndarray, "budget level"]

@@ -33,7 +33,7 @@ from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.runtime import prepare_jax
 
 BUDGET = 64_000  # env steps of an expert
-FIRST = 1_000_000  # level id: nothing was tuned on levels from there on
+FIRST = 1_000_000  # first level id; nothing was tuned on this level or later ones
 UNIT = 64  # levels at a time
 KINDS = ("chosen", "first")  # the most portable candidate, and the first candidate
 

@@ -50,7 +50,7 @@ class Result:
 
 def register(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of every race."""
-    parser.add_argument("--size", nargs="+", choices=list(SIZES), default=["s"], help="of the levels (default: s)")
+    parser.add_argument("--size", nargs="+", choices=list(SIZES), default=["s"], help="sizes of levels (default: s)")
     parser.add_argument("--repeats", type=int, default=5, help="timed runs of each side; medians count (default: 5)")
     parser.add_argument("--level-file", type=Path, help="levels as the reference's arrays (default: it samples some)")
 

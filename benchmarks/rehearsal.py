@@ -1,8 +1,8 @@
 """A rehearsal of a job of millions of levels on thousands of workers: the real scheduler under a simulated clock.
 
 Levels take as long as levels of a real run did. Machines die, or are taken away with notice, and are replaced; workers
-crash; some are slow. The driver handles one report at a time, and a worker waits for its turn. Counted are levels, lost
-work, reports, requests to the store, and the driver's time and memory.
+crash; some are slow. The driver handles one report at a time, and a worker waits for its turn. The rehearsal counts
+levels, lost work, reports, requests to the store, and the driver's time and memory.
 """
 
 import argparse
@@ -29,11 +29,11 @@ from levelproof.pipeline.jobs.schedule import Round, Scheduler, schedule, until_
 from levelproof.pipeline.jobs.sizing import MAX_FACTOR
 
 UNTIMED, SLOTS = 32, 4  # levels of the first units, before any are timed; slots of size s on a core
-HEARING = 1e-3  # s of the driver per report besides the scheduler's, for Ray's call and answer; assumed
+HEARING = 1e-3  # s that the driver spends per report besides the scheduler's, on Ray's call and response; assumed
 PUTS = 3500  # requests/s to one prefix of S3, from its documentation
 REQUESTS = 13  # per unit of density full: a shard of 11 files, its mark, its fragment
 POLL = 1.0  # s between offers to idle workers
-REPLACEMENT = 300.0  # s until another machine replaces one that is gone
+REPLACEMENT = 300.0  # s until another machine replaces one that left
 
 
 @dataclass(frozen=True)
@@ -60,15 +60,15 @@ class Counts:
 
     seconds: float = 0.0  # by the simulated clock
     levels: int = 0
-    there: float = 0.0  # s of workers, from joining to leaving
-    useful: float = 0.0  # s of workers, on committed levels
-    lost: float = 0.0  # s of workers, on levels that were not committed
+    there: float = 0.0  # worker-seconds, from joining to leaving
+    useful: float = 0.0  # worker-seconds spent on committed levels
+    lost: float = 0.0  # worker-seconds spent on levels that were not committed
     reports: int = 0
     commits: int = 0
     scheduling: float = 0.0  # s of this process, in the scheduler
     hearing: float = 0.0  # s of the simulated driver
     quarantined: int = 0
-    gone: int = 0  # machines taken away or dead
+    gone: int = 0  # machines that were taken away or failed
 
 
 class Rehearsal:
@@ -83,14 +83,14 @@ class Rehearsal:
         self._machines: dict[int, list[SimulatedWorker]] = {}
         for machine in range(-(-scene.workers // scene.a_machine)):
             self._at(self._rng.uniform(0, 60), "join", machine)
-        self._at(POLL, "look", None)
+        self._at(POLL, "poll", None)
 
     def run(self) -> Counts:
-        handle = {"join": self._join, "report": self._report, "look": self._look, "crash": self._crash}
+        handle = {"join": self._join, "report": self._report, "poll": self._poll, "crash": self._crash}
         while not (self._machines and self._scheduler.over):
             self.counts.seconds, _, kind, payload = heappop(self._events)
             if kind in ("preempted", "dies"):
-                self._goes(*payload, notice=kind == "preempted")
+                self._remove_machine(*payload, notice=kind == "preempted")
             else:
                 handle[kind](payload)
         left = (worker for workers in self._machines.values() for worker in workers)
@@ -148,15 +148,15 @@ class Rehearsal:
         self.counts.levels += sum(len(outcome.unit.level_ids) for outcome in round.outcomes)
         self._scheduled(self._scheduler.report, worker, round, self.counts.seconds)
 
-    def _look(self, _: None) -> None:
-        """Share out levels, and order idle workers to take them."""
+    def _poll(self, _: None) -> None:
+        """Redistribute levels, and give idle workers their orders."""
         if self._idle:
             self._scheduled(self._scheduler.share)
             for worker in [*self._idle]:
                 if not self._scheduler.waiting:
                     break
                 self._order(worker)
-        self._at(self.counts.seconds + POLL, "look", None)
+        self._at(self.counts.seconds + POLL, "poll", None)
 
     def _crash(self, worker: SimulatedWorker) -> None:
         """Kill a process: its units count as failed, and another process replaces it."""
@@ -171,8 +171,8 @@ class Rehearsal:
         self._at(self.counts.seconds + self._rng.exponential(self.scene.crashes), "crash", other)
         self._order(other)
 
-    def _goes(self, machine: int, workers: list[SimulatedWorker], notice: bool) -> None:
-        """Remove a machine, with notice or dead, and schedule its replacement."""
+    def _remove_machine(self, machine: int, workers: list[SimulatedWorker], notice: bool) -> None:
+        """Remove a machine, which leaves with notice or dies, and schedule its replacement."""
         if self._machines.get(machine) is not workers:
             return
         self.counts.gone += 1

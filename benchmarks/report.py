@@ -34,7 +34,7 @@ class Table:
 class Report:
     """Results of a benchmark."""
 
-    title: str  # of its page
+    title: str  # title of the page
     results: Sequence[Mapping[str, Any]]  # JSON documents; those of races have `ours`, `reference`, `ratio`
     tables: Sequence[Table]
     notes: Sequence[str] = ()  # sentences below the tables

@@ -24,7 +24,8 @@ from benchmarks.statistics import wilson
 from levelproof.configs.numbers import parse_count
 from levelproof.experts.config import MAX_COUNTED
 from levelproof.experts.search.config import SearchConfig
-from levelproof.experts.search.explore import Search, begin, explore, success_of
+from levelproof.experts.search.explore import Search, begin, explore
+from levelproof.experts.search.play import success_of
 from levelproof.experts.search.search import side_by_side
 from levelproof.experts.verdict.before import decide
 from levelproof.experts.witness.witness import replay
@@ -34,7 +35,7 @@ from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.runtime import cache_folder, own_cores, prepare_jax
 
-FIRST = 1_000_000  # level id: nothing was tuned on levels from there on
+FIRST = 1_000_000  # first level id; nothing was tuned on this level or later ones
 LEVELS = {"s": 256, "m": 128, "l": 64}
 MIN_STEPS = 16_384  # env steps where the curve begins
 CONFIG = SearchConfig(
@@ -129,7 +130,7 @@ def advanced(
     """
     start = begin(levels, level_ids, CONFIG, DEFAULT_RULES)
     known = joined([row or fresh for row, fresh in zip(rows, split(start), strict=True)])
-    search = replace(known, levels=start.levels, key=start.key)
+    search = replace(known, levels=start.levels, level_ids=start.level_ids)
     while np.asarray((search.length == 0) & (search.env_steps < env_steps)).any():
         search = explore(search, CONFIG, DEFAULT_RULES)
     return split(search)
@@ -137,7 +138,7 @@ def advanced(
 
 def split(search: Search) -> list[Search]:
     """Split a search into a row per level, on the host, without constants and the archives of solved levels."""
-    evolving = jax.device_get(replace(search, levels=None, key=None))
+    evolving = jax.device_get(replace(search, levels=None, level_ids=None))
     rows = [jax.tree.map(lambda x, i=i: x[i : i + 1], evolving) for i in range(len(evolving.length))]
     return [replace(row, archive=None) if row.length[0] else row for row in rows]
 

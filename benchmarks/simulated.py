@@ -11,7 +11,7 @@ from levelproof.pipeline.jobs.schedule import Cut, Order, Round, Summary, UnitOu
 
 
 class Work:
-    """Seconds of every level: the same on whichever worker."""
+    """Seconds of every level, the same on any worker."""
 
     def __init__(self, seconds: Float[np.ndarray, " level"]) -> None:
         drawn = np.random.default_rng(0).choice(seconds, 2**20)

@@ -25,5 +25,5 @@ def mcnemar(only_one: int, only_other: int) -> float:
 
 
 def holm(p: Sequence[float]) -> list[float]:
-    """Return corrected p in the given order; Holm's procedure rejects where they are below its level."""
+    """Return corrected p in the given order; Holm's procedure rejects the hypotheses whose p is below its level."""
     return np.asarray(multipletests(p, method="holm")[1]).tolist() if p else []

@@ -30,7 +30,8 @@ from levelproof.pipeline.read.rows import COLUMNS, read_rows
 from levelproof.pipeline.runtime import own_cores, prepare_jax
 from levelproof.pipeline.store.formats import Encoding
 from levelproof.pipeline.store.manifest import require_manifest
-from levelproof.pipeline.store.shard import Shard, open_shard, stored_bytes, write_shard
+from levelproof.pipeline.store.named import open_shard
+from levelproof.pipeline.store.shard import Shard, stored_bytes, write_shard
 
 PUBLISHED = {"s": 80, "m": 111, "l": 306}  # bytes per transition of Kinetix's 1M splits
 BATCH = 64  # random trajectories per read

@@ -13,19 +13,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.endless import endless_queue, update_slots
+from benchmarks.endless import endless_slots, update_slots
 from benchmarks.report import Report, Table
 from levelproof.experts.config import ExpertConfig
 from levelproof.experts.policy import network_of
 from levelproof.experts.pool.pool import slot_count
 from levelproof.experts.training import ppo
-from levelproof.experts.training.ppo import LevelConstants, Samples
+from levelproof.experts.training.advance import sample_rows
+from levelproof.experts.training.ppo import LevelConstants
 from levelproof.experts.training.rollout import ActionRule, rollout, start
-from levelproof.experts.training.slots import empty_slots
 from levelproof.levelgen.batching import repeat
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
-from levelproof.levelgen.task.actions import CHOICES, action_mask
+from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.runtime import own_cores, prepare_jax
 
@@ -53,22 +53,18 @@ def run(args: argparse.Namespace) -> Report:
 def calls(levels: Level, config: ExpertConfig) -> Iterator[Callable[[], Any]]:
     """Yield functions without arguments that run a rollout, an update, and both."""
     count = levels.role.shape[-1]
-    queue = endless_queue(levels, config)
-    slots, _ = update_slots(empty_slots(count, queue, config), queue, config)
+    slots, _ = update_slots(endless_slots(levels, np.arange(count), config), config)
     experts, levels = slots.slot.training.train_state, jax.tree.map(jnp.asarray, levels)
     experts = jax.tree.map(jnp.copy, experts)  # `update_slots` donates its slots
     lanes, network = config.environments * count, network_of(levels.size, config)
-    off = jnp.zeros(lanes, bool)
-    manner = ActionRule(off, jnp.zeros(lanes), off, jnp.zeros((256, len(CHOICES), count), jnp.int8))
+    manner = ActionRule.sampling(lanes, count)
     keys, acting = jax.random.split(jax.random.key(0), count), start(repeat(levels, config.environments))
     ours = config.horizon, DEFAULT_RULES
     act = jax.jit(lambda params, acting: rollout(network, params, levels, acting, keys, manner, *ours))
     yield partial(act, experts.params, acting)
 
-    _, seen, last_value = act(experts.params, acting)
-    advantage = ppo.advantages(seen.value, seen.reward, seen.done, last_value, config)
-    samples = Samples(seen.moving, seen.action, seen.log_probability, seen.value, advantage, jnp.zeros_like(advantage))
-    rows = jax.vmap(ppo.as_rows, in_axes=-2)(samples)
+    _, trajectory, last_value = act(experts.params, acting)
+    rows = sample_rows(trajectory, last_value, manner.rehearsing, config)
     constants = LevelConstants(network.constant(levels), action_mask(levels))
     constants = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), constants)
 
@@ -81,7 +77,7 @@ def calls(levels: Level, config: ExpertConfig) -> Iterator[Callable[[], Any]]:
 
     def both() -> Any:
         nonlocal slots
-        slots, report = update_slots(slots, queue, config)
+        slots, report = update_slots(slots, config)
         return report
 
     yield both

@@ -34,7 +34,7 @@ UNIT = 32  # levels
 WORKERS, UNITS = 1_000, (2_000, 20_000, 200_000)  # simulated
 SECONDS = 6.0  # mean time of a simulated unit; every worker has its own rate
 POLL = 0.25  # s
-LOAD_TIMEOUT = 600.0  # s that a process waits until the other has loaded its programs
+LOAD_TIMEOUT = 600.0  # s that a process waits for the others to load their programs
 TIMED_UNITS = 8  # units that a process times, after one that loads its programs
 SPREAD = 0.5  # standard deviation of the logarithm of workers' rates
 

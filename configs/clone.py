@@ -14,6 +14,7 @@ class CloneConfig:
 
     where: str = "label = 'solved'"  # SQL condition on the manifest's columns that selects levels
     episodes: Literal["first", "all"] = "first"  # first: each record up to its first goal; all: whole records
+    mirror: bool = False  # also learn from mirrored witnesses, of those that solve their mirrored level
     validation: float = 0.1  # share of the levels that are kept from training, chosen by content hash
     pool: int = 16_384  # levels in memory, between which every update draws evenly
     refresh: int = 1000  # updates until other levels take their place, if the splits have more
@@ -28,4 +29,4 @@ class CloneConfig:
         require(self, ("seed",), 0, 2**31 - 1)
         require(self, ("validation",), 0, 1)
         if self.validation in (0, 1):
-            raise ValueError(f"validation is {self.validation}: it must be between 0 and 1, and neither")
+            raise ValueError(f"validation is {self.validation}: it must be above 0 and below 1")

@@ -1,12 +1,12 @@
 """Hydra's edge: override strings in, a typed JobConfig out."""
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from importlib.resources import files
 from itertools import product
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from hydra import compose, initialize_config_module
 from hydra.core.config_store import ConfigStore
@@ -16,19 +16,23 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from levelproof.configs.clone import CloneConfig
 from levelproof.configs.convert import flat, plain, typed
 from levelproof.configs.errors import ConfigError, suggestion
-from levelproof.configs.schema import JobConfig, from_files, hash_of
+from levelproof.configs.schema import REPEATED, JobConfig, from_files, hash_of
 from levelproof.levelgen.sampling.distribution import Distribution
 
+if TYPE_CHECKING:
+    from levelproof.configs.clone import CloneConfig
+    from levelproof.configs.train import TrainConfig
+
+T = TypeVar("T")
 JOB = "generate"
 PACKAGE = "levelproof.configs"  # package of the yaml files
 ConfigStore.instance().store(name="code", node=plain(JobConfig()))  # the defaults that configs/generate.yaml names
 # Entries of JobConfig.results that are not settings, or that are handled separately
-NOT_COPIED = frozenset({"size", "distribution", "budget", "sampler_version"})
-# Strings: 007 stays 007
-VERBATIM = frozenset({"size", "levels", "level_files", "budget", "out", "continue_from", "where"})
+NOT_COPIED = frozenset({"size", "distribution", "budget", "sampler_version", "engine_version", *REPEATED})
+# Values are taken as strings: 007 stays 007
+VERBATIM = frozenset({"size", "levels", "level_files", "budget", "out", "continue_from", "where", "start"})
 FOLDERS = ("procedure", "distribution")  # folders of presets
 FOR_RANDOM_LEVELS = ("size", "levels", "first_level", "distribution")
 
@@ -48,7 +52,7 @@ def compose_job(overrides: Sequence[str]) -> JobConfig:
 
 
 def settings(overrides: Sequence[str]) -> dict[str, Any]:
-    """Return the composed settings as nested plain mappings, with values not checked yet."""
+    """Return the composed settings as nested plain mappings; values are not yet checked."""
     parsed = [_parse(text) for text in overrides]
     _check_keys(parsed, _known())
     return _compose([override.input_line or "" for override in parsed])
@@ -120,7 +124,7 @@ def _load(folder: str, name: str) -> dict[str, Any]:
 
 
 def _changes(folder: str, name: str) -> dict[str, Any]:
-    """Return the settings that a preset changes: in the group named like its folder, or in any group."""
+    """Return the settings that a preset changes: in its folder's group, or in any group if the folder names none."""
     content = _load(folder, name)
     return flat({folder: content} if folder in JobConfig.__annotations__ else content)
 
@@ -183,7 +187,7 @@ def _check_keys(overrides: Sequence[Override], known: Mapping[str, Any]) -> None
 
 
 def _in_grammar(value: Any) -> str:
-    """Write a value in the grammar of Hydra's overrides; quote strings only if that is necessary."""
+    """Write a value in the grammar of Hydra's overrides; quote strings only if necessary."""
     if value is None:
         return "null"
     if isinstance(value, bool):
@@ -196,17 +200,53 @@ def _in_grammar(value: Any) -> str:
     return value if unquoted else QuotedString(value, Quote.single).with_quotes()
 
 
-def compose_clone(overrides: Sequence[str]) -> CloneConfig:
+def compose_clone(overrides: Sequence[str]) -> "CloneConfig":
     """Return the settings of `levelproof clone` that `overrides` (`key=value` strings) change.
 
     Raises:
         ConfigError: a setting is unknown or has a wrong value.
     """
-    known, nested = flat(plain(CloneConfig())), {}
-    for override in map(_parse, overrides):
+    from levelproof.configs.clone import CloneConfig  # imports flax and optax, which jobs do not need
+
+    return _changed(CloneConfig, map(_parse, overrides))
+
+
+def compose_train(overrides: Sequence[str]) -> "TrainConfig":
+    """Return the settings of `levelproof train` that `overrides` (`key=value` strings) change.
+
+    Raises:
+        ConfigError: a setting is unknown, has a wrong value, or has no effect beside the others.
+    """
+    from levelproof.configs.train import CURRICULA, TrainConfig  # imports flax
+
+    parsed = [_parse(text) for text in overrides]
+    config = _changed(TrainConfig, parsed)
+    names = [override.key_or_group for override in parsed]
+    random = config.levels in CURRICULA
+    useless = ("where",) if random else ("size", "distribution")
+    for name in names:
+        if name.partition(".")[0] in useless:
+            kind = "random levels" if random else "the levels of a split or of files"
+            raise ConfigError(f"{name} has no effect on {kind}, as levels={config.levels} names: leave it out.")
+        if config.levels != "learnability" and name.startswith("curriculum."):
+            raise ConfigError(f"{name} has no effect with levels={config.levels}: leave it out.")
+        if not config.start and name in ("ppo.critic_updates", "ppo.kl_weight", "ppo.kl_updates"):
+            raise ConfigError(f"{name} has no effect without start: leave it out.")
+        if config.start and name.startswith("network."):
+            raise ConfigError(f"{name} is that of the policy to start from: leave it out, or leave out start.")
+    if random and config.distribution not in distributions():
+        hint = suggestion(config.distribution, distributions())
+        raise ConfigError(f"there is no distribution {config.distribution}{hint}.")
+    return config
+
+
+def _changed(cls: type[T], overrides: Iterable[Override]) -> T:
+    """Return a dataclass of settings with changes; it has no yaml file and no presets."""
+    known, nested = flat(plain(cls())), {}
+    for override in overrides:
         key = override.key_or_group
         if key not in known:
             raise ConfigError(f"there is no setting {key}{suggestion(key, known)}: choose one of {', '.join(known)}.")
         group, _, name = key.rpartition(".")
         (nested.setdefault(group, {}) if group else nested)[name] = override.value()
-    return typed(CloneConfig, nested)
+    return typed(cls, nested)

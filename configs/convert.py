@@ -1,6 +1,6 @@
 """Conversion of Hydra's dictionaries to typed frozen dataclasses, and back to plain data for hashing.
 
-cattrs structures values by the dataclasses' annotations. This module decides which types a value may have, and words
+cattrs structures values by the dataclasses' annotations. This module decides which types a value may have, and phrases
 the errors; dataclasses check ranges themselves (`__post_init__` raises ValueError). No dictionary travels beyond this
 module's callers.
 """
@@ -32,7 +32,7 @@ SCALARS = {  # name for messages, and types of accepted values: a string setting
 def typed(cls: type[T], values: Mapping[str, Any], path: str = "") -> T:
     """Return an instance of the dataclass `cls` from nested mappings; missing fields take their defaults.
 
-    `path` names their group in messages.
+    `path` names the group of the settings in messages.
 
     Raises:
         ConfigError: a key is unknown, a value has the wrong type, or the dataclass rejects it.

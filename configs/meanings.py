@@ -49,7 +49,7 @@ class Comment(NamedTuple):
     """The comments on one name in the body of a class."""
 
     heading: str  # the last comment above it or above an earlier name
-    beside: str  # the comment on its own lines
+    beside: str  # the comments on its own lines
 
 
 def every_setting() -> list[Setting]:

@@ -15,12 +15,15 @@ from levelproof.experts.procedure import Procedure
 from levelproof.experts.search.config import SearchConfig
 from levelproof.levelgen.identity.keys import MAX_LEVEL_ID, SAMPLER_VERSION
 from levelproof.levelgen.level import SIZES, size_of
+from levelproof.levelgen.sampling.block import control_weights
 from levelproof.levelgen.sampling.distribution import CONTROL_WEIGHTS, Distribution
-from levelproof.levelgen.sampling.sampler import check_size, control_weights
+from levelproof.levelgen.sampling.sampler import check_size
 from levelproof.levelgen.task.rules import TaskParams
+from levelproof.physics.step import ENGINE_VERSION
 
 HASH_DIGITS = 16
 Density = Literal["full", "resume", "witness"]  # how much of a record is stored
+Executor = Literal["auto", "ray", "inline"]
 KEY_EVERY = 32  # default env steps between key frames
 KEYS_EVERY = tuple(2**i for i in range(1, 9))  # allowed values: each divides a record's 256 steps
 MAX_FRAME_SKIP = 64  # for densities whose readers re-simulate records
@@ -28,6 +31,7 @@ MAX_BODIES = 48  # the largest number that was tried; compiling takes minutes th
 # Largest number of bodies, and levels of an untimed work unit: units take about equally long, and have multiples of
 # the number of experts that train side by side
 UNITS = ((SIZES["s"].bodies, 32), (SIZES["m"].bodies, 16), (SIZES["l"].bodies, 8), (MAX_BODIES, 4))
+GROWN_UNIT = 8  # units of records that grow from seeds, in units of trained levels
 
 # Settings of place, amount and machine: they change neither a level nor its expert, so a split may mix their values
 WITHOUT_EFFECT = frozenset(
@@ -54,7 +58,10 @@ RENAMED: Mapping[str, str] = {}  # today's dotted names of settings by their nam
 REMOVED: Mapping[str, Any] = {"scout.rounds": 0}  # settings of earlier versions: the value that matches this version
 # Values of `distribution` in the results of jobs whose levels are not sampled
 FROM_FILES, FROM_RECORDS = "files", "import"
-OF_RECORDS = ("size", "budget", "task", "sampler_version")  # settings that decide the results of an import
+# In the results of seed files and of splits grown from them: each record repeats its first episode
+REPEATED: Mapping[str, str] = {"witness": "repeated"}
+# Settings that decide the results of an import
+OF_RECORDS = ("size", "budget", "task", "sampler_version", "engine_version")
 
 
 @dataclass(frozen=True)
@@ -68,7 +75,7 @@ class JobConfig:
     budget: str = "128k"  # env steps an expert may use; also names the folder
     out: str = "data"  # folder or object store's URL; the split is written to {out}/{budget}/{size}
     unit: int | None = None  # levels per work unit, lost if its worker dies; null: as many as take 20 to 60 s, as timed
-    executor: Literal["ray", "inline"] = "ray"  # ray: one worker per core or GPU; inline: this process, for debugging
+    executor: Executor = "auto"  # ray: one worker per core or GPU; inline: this process; auto: inline if levels are few
     device: Literal["cpu", "gpu"] = "cpu"  # of each worker; cpu: a core; gpu: a GPU, if one is free and JAX can use it
     workers: int = 0  # maximum number; 0: one per core that memory allows, or with device=gpu one per GPU
     checkpoint: str = ""  # interval for saving unfinished experts to resume, such as 10min; empty: never
@@ -114,7 +121,7 @@ class JobConfig:
 
     @property
     def levels_per_unit(self) -> int:
-        """Levels of a work unit; if units are timed, of the units before the first one has ended."""
+        """Number of levels in a work unit; if units are timed, only until the first one has ended."""
         if self.unit is not None:
             return self.unit
         bodies = size_of(self.size).bodies
@@ -140,6 +147,11 @@ class JobConfig:
         return stored_as(self.density, self.key_every)
 
     @property
+    def origin(self) -> str:
+        """What its levels' rows come from, as a progress report says it."""
+        return f"{self.budget} env steps each"
+
+    @property
     def env_steps(self) -> int:
         """The budget as a number."""
         return parse_count(self.budget, "budget")
@@ -150,7 +162,8 @@ class JobConfig:
         kept = decisive({f.name: plain(getattr(self, f.name)) for f in fields(self)})
         if self.level_files:
             kept["distribution"] = FROM_FILES
-        return kept | {"budget": self.env_steps, "sampler_version": SAMPLER_VERSION}
+        made = {"sampler_version": SAMPLER_VERSION, "engine_version": ENGINE_VERSION}
+        return kept | {"budget": self.env_steps} | made
 
     @property
     def hash(self) -> str:
@@ -171,6 +184,26 @@ class ImportConfig(JobConfig):
     def results(self) -> dict[str, Any]:
         known = super().results
         return {name: known[name] for name in OF_RECORDS} | {"distribution": FROM_RECORDS}
+
+
+@dataclass(frozen=True)
+class GrowConfig(JobConfig):
+    """The settings of a job of `levelproof grow`: `level_files` is a seed file, or a folder of some."""
+
+    grown: str = "{}"  # the `results` of the seed files, as JSON
+
+    @property
+    def origin(self) -> str:
+        return f"grown from {self.level_files}"
+
+    @property
+    def levels_per_unit(self) -> int:
+        """Number of levels in a work unit: more than of trained levels, because records take milliseconds."""
+        return GROWN_UNIT * super().levels_per_unit
+
+    @property
+    def results(self) -> dict[str, Any]:
+        return json.loads(self.grown)
 
 
 def from_files(results: Mapping[str, Any]) -> bool:

@@ -46,7 +46,7 @@ class Transitions(NamedTuple):
     """Steps of witnesses: levels, what moves in them, and the actions taken."""
 
     level: Level  # lanes last; `state` is None
-    motion: Float[Array | np.ndarray, "lane column"]  # MOTION numbers for each body, as `from_motion` reads them
+    motion: Float[Array | np.ndarray, "lane column"]  # MOTION numbers for each body, then any contacts: 1 where active
     action: Int[Array | np.ndarray, "lane 6"]
 
 
@@ -75,17 +75,17 @@ def optimiser_of(config: ImitationConfig) -> optax.GradientTransformation:
 
 @partial(jax.jit, static_argnames=("network", "size", "config"))
 def begin_imitation(seed: Int[Array, ""], network: NetworkConfig, size: Size, config: ImitationConfig) -> Imitation:
-    """Initialise a policy; `size` is that of the levels if the network fits one size only."""
+    """Initialise a policy; `size` is the levels' size, which matters only if the network fits a single size."""
     params = initial_policy(key_of_seed(seed), network, size)
     return Imitation(params, optimiser_of(config).init(params), params, jnp.int32(0))
 
 
 @partial(jax.jit, static_argnames=("network", "config"), donate_argnums=0)
 def imitate(
-    now: Imitation, seen: Transitions, network: NetworkConfig, config: ImitationConfig
+    now: Imitation, transitions: Transitions, network: NetworkConfig, config: ImitationConfig
 ) -> tuple[Imitation, Likeness]:
     """Take one update; return the likeness before it."""
-    (_, likeness), gradient = jax.value_and_grad(_loss, has_aux=True)(now.params, seen, network)
+    (_, likeness), gradient = jax.value_and_grad(_loss, has_aux=True)(now.params, transitions, network)
     change, state = optimiser_of(config).update(gradient, now.optimiser, now.params)
     params: Any = optax.apply_updates(now.params, change)
     # The first updates count for more, so that the average soon forgets the initial weights
@@ -95,16 +95,16 @@ def imitate(
 
 
 @partial(jax.jit, static_argnames="network")
-def compare(params: VariableDict, seen: Transitions, network: NetworkConfig) -> Likeness:
+def compare(params: VariableDict, transitions: Transitions, network: NetworkConfig) -> Likeness:
     """Compare a policy with data."""
-    return _loss(params, seen, network)[1]
+    return _loss(params, transitions, network)[1]
 
 
-def _loss(params: VariableDict, seen: Transitions, network: NetworkConfig) -> tuple[Float[Array, ""], Likeness]:
-    lanes, size, action = len(seen.motion), seen.level.size, jnp.asarray(seen.action).T
-    state = from_motion(seen.motion, size)
-    logits = policy_logits(params, network, replace(seen.level, state=state), state)
-    live = jnp.broadcast_to(action_mask(seen.level), (len(action), lanes))
+def _loss(params: VariableDict, transitions: Transitions, network: NetworkConfig) -> tuple[Float[Array, ""], Likeness]:
+    lanes, size, action = len(transitions.motion), transitions.level.size, jnp.asarray(transitions.action).T
+    state = from_motion(transitions.motion, size)
+    logits = policy_logits(params, network, replace(transitions.level, state=state), state)
+    live = jnp.broadcast_to(action_mask(transitions.level), (len(action), lanes))
     count = jnp.maximum(live.sum(0), 1)
     loss = -(log_probability(logits, action, live) / count).mean()
     right = ((most_probable(logits) == action) & live).sum(0) / count
@@ -112,12 +112,16 @@ def _loss(params: VariableDict, seen: Transitions, network: NetworkConfig) -> tu
 
 
 def from_motion(motion: Float[Array | np.ndarray, "lane column"], size: Size) -> State:
-    """Return the states, without contacts and impulses, which no network reads."""
-    by_body = jnp.asarray(motion).reshape(len(motion), size.bodies, MOTION).transpose(1, 2, 0)
-    return replace(
+    """Return states without impulses, which no network reads; with contacts only if the motion has their columns."""
+    motion, moving = jnp.asarray(motion), MOTION * size.bodies
+    by_body = motion[:, :moving].reshape(len(motion), size.bodies, MOTION).transpose(1, 2, 0)
+    state = replace(
         zeros_of(State, size, len(motion)),
         position=by_body[:, 0:2],
         velocity=by_body[:, 2:4],
         rotation=by_body[:, 4],
         angular_velocity=by_body[:, 5],
     )
+    if motion.shape[1] == moving:
+        return state
+    return replace(state, contact_active=motion[:, moving:].T > 0)

@@ -1,7 +1,7 @@
 """Costs of levels: seconds of a worker, and so of its core or GPU, by stage.
 
 Levels run side by side. Stages that serve all levels of a unit are split evenly; search, training and evaluation in
-proportion to env steps. Compiling is counted separately, because a worker pays it once, whatever it makes.
+proportion to env steps. Compiling is counted separately, because a worker pays for it once, whatever it makes.
 """
 
 import time
@@ -31,16 +31,16 @@ class _Compiled:
 
     def __init__(self) -> None:
         self.seconds = 0.0
-        self._last: list[tuple[float, float]] = []  # begin and duration of the latest events, none nested
+        self._last: list[tuple[float, float]] = []  # start and duration of the latest events, none nested
         monitoring.register_event_duration_secs_listener(self._note)
 
     def _note(self, event: str, duration_secs: float, **_: object) -> None:
         if not event.startswith(COMPILING):
             return
-        begun = time.perf_counter() - duration_secs
-        while self._last and self._last[-1][0] >= begun:
+        start = time.perf_counter() - duration_secs
+        while self._last and self._last[-1][0] >= start:
             self.seconds -= self._last.pop()[1]
-        self._last = [*self._last[-99:], (begun, duration_secs)]
+        self._last = [*self._last[-99:], (start, duration_secs)]
         self.seconds += duration_secs
 
 
@@ -50,10 +50,10 @@ _compiled = _Compiled()
 @contextmanager
 def lap() -> Iterator[Lap]:
     """Time the `with` block, which must wait for its device results."""
-    took, begun, compiled = Lap(), time.perf_counter(), _compiled.seconds
+    took, start, compiled = Lap(), time.perf_counter(), _compiled.seconds
     yield took
     took.compiling = _compiled.seconds - compiled
-    took.seconds = max(0.0, time.perf_counter() - begun - took.compiling)
+    took.seconds = max(0.0, time.perf_counter() - start - took.compiling)
 
 
 class Ledger:
@@ -105,7 +105,7 @@ class Ledger:
 
 
 class StepCosts:
-    """Splits the time of a pool's steps between training and evaluated slots.
+    """Splits the time of a pool's steps between slots that train and all others.
 
     A step of n slots, x of which train, takes about y = n * play + x * update seconds: every slot plays the same
     number of env steps. The slope of a least-squares line through (x, y) estimates the update; on a GPU, where slots

@@ -30,7 +30,7 @@ def network_of(size: Size, config: ExpertConfig) -> ActorCritic:
 
 
 def initial(key: Key[Array, ""], network: ActorCritic, constant: Constant) -> Params:
-    """Return initial parameters of an expert; `constant` gives shapes only."""
+    """Draw initial parameters of an expert; of `constant`, only the shapes matter."""
     return network.init(key, constant, jnp.zeros((len(dynamic_features(network.size)), 1)))
 
 
@@ -81,3 +81,11 @@ def entropy(logits: Float[Array, "logit lane"], live: Bool[Array, "6 lane"]) -> 
     """Return the entropy of the live entries, nats."""
     entries = zip(_entries(logits), live, strict=True)
     return -sum(jnp.where(counts, (jnp.exp(entry) * entry).sum(0), 0.0) for entry, counts in entries)  # type: ignore[return-value]
+
+
+def divergence(
+    logits: Float[Array, "logit lane"], other: Float[Array, "logit lane"], live: Bool[Array, "6 lane"]
+) -> Float[Array, " lane"]:
+    """Return the Kullback-Leibler divergence of `other` from a policy, KL(policy || other), of live entries, nats."""
+    entries = zip(_entries(logits), _entries(other), live, strict=True)
+    return sum(jnp.where(counts, (jnp.exp(p) * (p - q)).sum(0), 0.0) for p, q, counts in entries)  # type: ignore[return-value]

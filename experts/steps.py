@@ -10,11 +10,12 @@ class EnvSteps(NamedTuple):
     trained: int = 0
     evaluated: int = 0
     idle: int = 0  # in empty slots
+    replayed: int = 0  # of first episodes, where records grow from seeds
 
     @property
     def shown(self) -> int:
         """Env steps that a progress bar counts."""
-        return self.searched + self.trained
+        return self.searched + self.trained + self.replayed
 
 
 class Seconds(NamedTuple):

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 LANES = 64  # in a batch of replays
-BATCHES = (16, 64, 256)  # batch sizes, levels: one program for each, instead of one for each count
-LANES_ON_ACCELERATOR = 32_768  # enough to keep it busy
+BATCHES = (16, 64, 256)  # levels per batch: one program for each of these, not one for each count
+LANES_ON_ACCELERATOR = 32_768  # enough to keep an accelerator busy
 
 T = TypeVar("T")
 
@@ -29,12 +29,12 @@ def block_size(count: int, most: int) -> int:
 
 
 def at_once(lanes: int, in_cache: int) -> int:
-    """Return how many items of `lanes` lanes each a program takes at once; `in_cache` lanes fit a core's cache."""
+    """Return the number of items per program call, each of `lanes` lanes; `in_cache`: lanes that fit a core's cache."""
     return max(1, (in_cache if jax.default_backend() == "cpu" else LANES_ON_ACCELERATOR) // lanes)
 
 
 def take(tree: T, lanes: np.ndarray) -> T:
-    """Return the lanes with these indices, of every array."""
+    """Select the lanes with these indices from every array."""
     return jax.tree.map(lambda x: x[..., lanes], tree)
 
 

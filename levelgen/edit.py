@@ -1,7 +1,7 @@
 """Edits of levels by hand: add, move, turn, resize and fix bodies, set roles, attach joints and thrusters.
 
 An edit is a pure function from one level, whose arrays have one lane, to another. Joined bodies stay joined: moving or
-turning a body takes along every body that joints hold to it. Masses are computed as in the sampler.
+turning a body also moves every body that joints hold to it. Masses are computed as in the sampler.
 """
 
 from collections.abc import Callable, Iterator
@@ -39,7 +39,7 @@ def add_body(level: Level, shape: str, x: float, y: float) -> Level:
     """Add a `circle`, `rectangle` or `triangle` with its centre at (x, y), plain and free to move."""
     circle = shape == "circle"
     if not circle and shape not in SHAPES:
-        raise EditError(f"Unknown shape {shape!r}: take circle, {', '.join(SHAPES)}.")
+        raise EditError(f"Unknown shape {shape!r}: choose circle, {' or '.join(SHAPES)}.")
 
     def change(one: Level) -> None:
         model, first = one.model, one.size.polygons if circle else FIXED_POLYGONS
@@ -90,7 +90,7 @@ def resize(level: Level, body: int, factor: float) -> Level:
         _movable_group(one, body)
         circle = body - one.size.polygons
         shape = one.model.radius[circle : circle + 1] if circle >= 0 else one.model.vertices[body]
-        reach = factor * np.abs(shape).max()
+        reach = factor * (shape.max() if circle >= 0 else np.linalg.norm(shape, axis=-1).max())
         if not MIN_REACH <= reach <= MAX_REACH:
             raise EditError(
                 f"The body would reach {reach:.2f} m from its centre: keep it between {MIN_REACH} and {MAX_REACH} m."
@@ -182,7 +182,7 @@ def delete(level: Level, kind: str, index: int) -> Level:
 
 
 _BINDINGS = {"joint": MOTOR_BINDINGS, "thruster": THRUSTER_BINDINGS}
-_OF_KIND: dict[str, tuple[Callable[[Level], Any], Callable[[Level], Any]]] = {  # which are active, bindings
+_OF_KIND: dict[str, tuple[Callable[[Level], Any], Callable[[Level], Any]]] = {  # active flags, bindings
     "joint": (lambda one: one.model.joint_active, lambda one: one.motor_binding),
     "thruster": (lambda one: one.model.thruster_active, lambda one: one.thruster_binding),
 }
@@ -226,9 +226,9 @@ def _edited(level: Level, change: Callable[[Level], None]) -> Level:
 
 
 def _free(active: Any, kind: str, level: Level) -> int:
-    """Return the first unused row."""
+    """Return the first inactive row, or raise EditError, in which `kind` names the rows."""
     if active.all():
-        raise EditError(f"Size {name_of(level.size)} has no room for more {kind}: delete one, or take a larger size.")
+        raise EditError(f"Size {name_of(level.size)} has no room for more {kind}: delete one, or use a larger size.")
     return int(active.argmin())
 
 
@@ -282,7 +282,7 @@ def _joints(one: Level) -> Iterator[tuple[int, int, Any, Any]]:
 def _joined(one: Level, body: int) -> list[int]:
     """Return a body and all bodies that joints hold to it, directly or not; nearest first."""
     group = [body]
-    for member in group:  # grows while it is walked
+    for member in group:  # visits the bodies appended below, too
         group += [b for a, b, *_ in _joints(one) if a == member and b not in group]
     return group
 
@@ -306,5 +306,5 @@ def _anchors(one: Level) -> Iterator[tuple[Any, Any]]:
 
 
 def _inside(one: Level, body: int, x: float, y: float) -> np.ndarray:
-    """Transform a point of the world into a body's frame."""
+    """Transform a point from the world to a body's frame."""
     return turned(np.array((x, y)) - one.state.position[body], -one.state.rotation[body])

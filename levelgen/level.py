@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -20,12 +21,13 @@ SIZES: dict[str, Size] = {
     "m": Size(polygons=6, circles=3, joints=2, thrusters=2),
     "l": Size(polygons=12, circles=4, joints=6, thrusters=2),
 }
-MAX_PER_KIND = 64  # polygons, circles, joints or thrusters in a level; a level file with 64 of each has 3 MB
+MAX_PER_KIND = 64  # polygons, circles, joints or thrusters in a level; a level file with 64 of each is 3 MB long
 MOTOR_BINDINGS = 4  # entries of an action that motors obey
 THRUSTER_BINDINGS = 2  # entries that thrusters obey
 ACTIONS = MOTOR_BINDINGS + THRUSTER_BINDINGS
 WORLD_SIDE = 5.0  # m
 HALF_WORLD = WORLD_SIDE / 2
+KERNEL_SOURCES = [Path(__file__).parents[1] / room for room in ("physics", "levelgen")]  # of kernels over levels
 
 
 class Role(IntEnum):
@@ -88,7 +90,7 @@ def concatenate_levels(parts: Sequence[Level]) -> Level:
 
 
 def size_of(name: str | Size) -> Size:
-    """Return the size with a name: one of SIZES, or four numbers as in `8-8-8-4`. A Size is returned unchanged.
+    """Return the size that a name stands for: one of SIZES, or four numbers as in `8-8-8-4`. A Size stays unchanged.
 
     The numbers count polygons (the scenery's four included), circles, joints and thrusters.
 

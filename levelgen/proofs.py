@@ -103,7 +103,7 @@ def immovable(model: Model) -> Bool[Array, "body lane"]:
 
 
 def goal_stands(level: Level, params: Params) -> Bool[Array, " lane"]:
-    """Whether every pair of a green and a blue body that may touch stays still."""
+    """Whether both bodies stay still in every pair of green and blue that may touch."""
     moves, moving_goals = ~still(level, params), []
     pairs = pairs_of(level.size)
     for pair in (pairs.polygon, pairs.circle_polygon, pairs.circle):

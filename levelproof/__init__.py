@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     from levelproof.levelgen.level import concatenate_levels as concatenate_levels
     from levelproof.levelgen.pictures.raster import draw as draw
     from levelproof.levelgen.sampling.distribution import Distribution as Distribution
+    from levelproof.levelgen.sampling.sampler import Sampler as Sampler
     from levelproof.levelgen.sampling.sampler import sample_levels as sample_levels
+    from levelproof.levelgen.sampling.sampler import sampler as sampler
     from levelproof.levelgen.task.environment import starts as starts
     from levelproof.levelgen.task.lanes import Lanes as Lanes
     from levelproof.levelgen.task.rules import TaskParams as TaskParams
@@ -81,7 +83,9 @@ HOME = {
     "read_level_file": "levelproof.levelgen.files.level_file",
     "read_manifest": "levelproof.pipeline.store.manifest",
     "replay": "levelproof.experts.witness.witness",
+    "Sampler": "levelproof.levelgen.sampling.sampler",
     "sample_levels": "levelproof.levelgen.sampling.sampler",
+    "sampler": "levelproof.levelgen.sampling.sampler",
     "save_policy": "levelproof.experts.networks.saved",
     "starts": "levelproof.levelgen.task.environment",
     "to_gymnax": "levelproof.levelgen.task.to_gymnax",

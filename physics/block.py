@@ -87,7 +87,7 @@ class Block(NamedTuple):
     table: Table  # lookup tables of the size
     inputs: Inputs  # the worlds before
     after: State  # receives the worlds after the step
-    seen: Manifold | None  # receives the contacts; None unless the caller asked for them
+    contacts: Manifold | None  # receives the contacts; None unless the caller asked for them
     scratch: Scratch
 
     @property

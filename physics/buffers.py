@@ -55,5 +55,5 @@ def buffers_like(arrays: Any) -> Any:
 
 
 def zeros_of(cls: type[T], size: Size, lanes: int) -> T:
-    """Return a `cls` like `buffers_of`, with arrays of zeros."""
+    """Return a `cls` as `buffers_of` does, with an array of zeros in place of each Buffer."""
     return jax.tree.map(lambda buffer: jnp.zeros_like(buffer.array(lanes)), buffers_of(cls, size))

@@ -15,8 +15,8 @@ resting contact is found again in the next step instead of flickering. Restituti
 before the solver starts and e the smaller coefficient of the two bodies.
 
 **Accumulation.** One contact's impulse disturbs its neighbours, so `solve` passes over all of them ten times. Each pass
-clamps the *sum* of a contact's impulses to j >= 0, not the increment: a later pass may take back what an earlier one
-pushed too much. Friction does the same along the tangent t = (n.y, -n.x), where Coulomb's cone bounds the sum by
+clamps the *sum* of a contact's impulses to j >= 0, not the increment: a later pass may take back an earlier one's
+excess. Friction does the same along the tangent t = (n.y, -n.x), where Coulomb's cone bounds the sum by
 |j_t| <= friction * j. Friction combines as sqrt((f a)^2 + (f b)^2), f = base_friction.
 
 **Warm starting.** A contact that was active in the last step starts from the impulses that it ended with there. A stack
@@ -68,7 +68,7 @@ class Levers(NamedTuple):
 
 def clear(block: Block) -> None:
     """Reset all contacts: none pushes, none is remembered, none is recorded as active."""
-    constraints, after, seen = block.scratch.constraints, block.after, block.seen
+    constraints, after, contacts = block.scratch.constraints, block.after, block.contacts
 
     def blank(ref):
         def one(i):
@@ -76,16 +76,22 @@ def clear(block: Block) -> None:
 
         return one
 
-    contacts = after.contact_active, after.contact_normal_impulse, after.contact_tangent_impulse
-    for ref in (*contacts, constraints.touching, constraints.counts):
+    kept = after.contact_active, after.contact_normal_impulse, after.contact_tangent_impulse
+    for ref in (*kept, constraints.touching, constraints.counts):
         each(ref.shape[0], blank(ref))
-    if seen is not None:
+    if contacts is not None:
 
         def blank_all(c):
-            for ref in (seen.active, seen.normal, seen.penetration, seen.point, seen.restitution_velocity):
+            for ref in (
+                contacts.active,
+                contacts.normal,
+                contacts.penetration,
+                contacts.point,
+                contacts.restitution_velocity,
+            ):
                 ref[c] = jnp.zeros_like(ref[c])
 
-        each(seen.active.shape[0], blank_all)
+        each(contacts.active.shape[0], blank_all)
 
 
 def count_touching(block: Block, kind: int, contacts: list[Contact]) -> Float[Array, " lane"]:
@@ -112,16 +118,16 @@ def bounce(block: Block, a: Scalar, b: Scalar, contact: Contact) -> Float[Array,
 
 
 def record(block: Block, c: Scalar, contact: Contact) -> None:
-    """Record a contact in `block.seen`, if the caller asked for contacts; zero in inactive lanes."""
-    seen, table = block.seen, block.table
-    if seen is None:
+    """Record a contact in `block.contacts`, if the caller asked for contacts; zero in inactive lanes."""
+    contacts, table = block.contacts, block.table
+    if contacts is None:
         return
     keep = lambda x: jnp.where(contact.active, x, 0.0)
-    seen.active[c] = contact.active
-    seen.normal[c] = keep(jnp.stack([*contact.normal]))
-    seen.penetration[c] = keep(contact.penetration)
-    seen.point[c] = keep(jnp.stack([*contact.point]))
-    seen.restitution_velocity[c] = keep(bounce(block, table.a[c], table.b[c], contact))
+    contacts.active[c] = contact.active
+    contacts.normal[c] = keep(jnp.stack([*contact.normal]))
+    contacts.penetration[c] = keep(contact.penetration)
+    contacts.point[c] = keep(jnp.stack([*contact.point]))
+    contacts.restitution_velocity[c] = keep(bounce(block, table.a[c], table.b[c], contact))
 
 
 def prepare(
@@ -168,7 +174,7 @@ def assign_batches(block: Block) -> None:
     """Assign each contact that pushes to its solver batch, and list the contacts of every batch.
 
     The reference sorts the pairs of a kind stably, those that do not touch first, and puts the pair of rank p, from 0,
-    into batch p mod batches. Of N pairs A touch; the k-th of them, k from 1, has rank N - A + k - 1. That arithmetic
+    into batch p mod batches. If A of N pairs touch, the k-th of these, k from 1, has rank N - A + k - 1. So arithmetic
     replaces the sort.
     """
     constraints, table = block.scratch.constraints, block.table
@@ -206,8 +212,8 @@ def assign_batches(block: Block) -> None:
 def solve(block: Block) -> None:
     """Run one pass over the contacts, batch by batch.
 
-    A batch only adds to `push`; the bodies take up its impulses when the batch is over. Where a batch has few contacts
-    their own bodies do so, else all bodies: the result is the same, and the loop over contacts is the shorter one.
+    A batch only adds to `push`; bodies yield to its impulses when the batch is over. If a batch has few contacts, only
+    their bodies yield, else all do: the result is the same, but the loop is shorter.
     """
     bodies, constraints, table = block.scratch.bodies, block.scratch.constraints, block.table
 
@@ -264,8 +270,8 @@ def _solve_one(block: Block, c: Scalar, segment: Scalar) -> None:
     lever = _levers(motion_a, motion_b, n, point)
     mass_normal = 1 / nonzero(mass + inertia_a * jnp.square(lever.cross_a) + inertia_b * jnp.square(lever.cross_b))
     mass_tangent = 1 / nonzero(mass + inertia_a * jnp.square(lever.dot_a) + inertia_b * jnp.square(lever.dot_b))
-    # Friction is solved after the normal impulse, but from the velocities before it: this is how much of the tangential
-    # velocity a unit of normal impulse changes, by turning the bodies
+    # Friction is solved after the normal impulse, but from the velocities before it: `coupling` is the change of
+    # tangential velocity per unit of normal impulse, which turns the bodies
     coupling = inertia_a * lever.cross_a * lever.dot_a + inertia_b * lever.cross_b * lever.dot_b
 
     v, w_a, w_b = velocity(motion_b) - velocity(motion_a), motion_a[4], motion_b[4]

@@ -32,13 +32,13 @@ def find_contacts(block: Block, params: Params) -> None:
     """Detect contacts, prepare them as constraints, and warm-start them."""
     contact.clear(block)
 
-    def found(kind: int, numbers: list, contacts: list[contact.Contact]) -> None:
+    def constrain(kind: int, indices: list, contacts: list[contact.Contact]) -> None:
         so_far = contact.count_touching(block, kind, contacts)
-        for group, (c, one) in enumerate(zip(numbers, contacts, strict=True), KIND_OF_GROUP.index(kind)):
+        for group, (c, one) in enumerate(zip(indices, contacts, strict=True), KIND_OF_GROUP.index(kind)):
             contact.prepare(block, params, c, one, group, so_far)
             contact.record(block, c, one)
 
-    manifold.find_contacts(block, found)
+    manifold.find_contacts(block, constrain)
     contact.assign_batches(block)
 
 

@@ -4,7 +4,7 @@ A joint pins a point of body a to a point of body b. With the anchors' world pos
 g = p_b - p_a and the anchors drift apart with d = v_b + w_b x r_b - v_a - w_a x r_a.
 
 **Linear part.** Box2D solves the two equations d = 0 with a 2x2 matrix. The reference solves one, along the direction
-of the drift, with that direction's effective mass, and adds the gap to what has to be undone:
+of the drift, with that direction's effective mass, and adds the gap to what must be undone:
 
     impulse = stiffness * (d + joint_bias_velocity * g) / (1/m_a + 1/m_b + (r_a x e)^2 / I_a + (r_b x e)^2 / I_b),
     e = d / |d|
@@ -15,8 +15,8 @@ A stiffness below 1 under-relaxes: the joints of a chain disturb each other, and
 joint_bias_position of the gap, the lighter body farther. Bodies therefore move *within* the solver, and contacts
 recompute their lever arms.
 
-**Angle.** A fixed joint pulls b back to its resting angle; a revolute joint with limits does so beyond a limit, and
-only while the bodies do not already turn back (`corrects`).
+**Angle.** A fixed joint pulls b back to its resting angle; a revolute joint with limits pulls b back to a limit that it
+has passed, but only while the bodies do not already turn back (`corrects`).
 
 Joints are solved one after another, each seeing what the last one changed (Gauss-Seidel).
 Source: `jax2d.joint`. The accumulated linear impulse is never reset there, nor here.
@@ -53,8 +53,8 @@ def _prepare_one(block: Block, params: Params, j: Scalar) -> None:
         mass = [model.inverse_mass[i], model.inverse_inertia[i]]
         return jnp.stack([alive, *mass, before.rotation[i], *bodies.turn[i]])
 
-    of_a, of_b = gather_pair(bodies.motion.shape[0], read, model.joint_a[j], model.joint_b[j])
-    (alive_a, mass_a, inertia_a, rotation_a, *turn_a), (alive_b, mass_b, inertia_b, rotation_b, *turn_b) = of_a, of_b
+    row_a, row_b = gather_pair(bodies.motion.shape[0], read, model.joint_a[j], model.joint_b[j])
+    (alive_a, mass_a, inertia_a, rotation_a, *turn_a), (alive_b, mass_b, inertia_b, rotation_b, *turn_b) = row_a, row_b
     acts = model.joint_active[j] & (alive_a * alive_b != 0) & ((mass_a != 0) | (mass_b != 0))
     mass_a, mass_b, inertia_a, inertia_b = (jnp.where(acts, x, 0.0) for x in (mass_a, mass_b, inertia_a, inertia_b))
     arm_a = Vec(*model.joint_anchor_a[j]).rotate(*turn_a)

@@ -1,7 +1,7 @@
 """The vocabulary of kernels: functions of a block of lanes, over references whose last axis is the lanes.
 
 A reference reads and writes rows: `ref[i]` is a row of lanes, and the index i may be known only at run time. A kernel
-computes what differs between lanes in all of them and selects; it skips what no lane needs. The same source becomes
+computes in all lanes whatever some lane needs, then selects; it skips what no lane needs. The same source becomes
 machine code (`levelproof.physics.codegen`), or plain XLA operations on all lanes at once.
 
 Whether a computation is skipped depends on the other lanes, so running it must change nothing in a lane that does not
@@ -12,7 +12,7 @@ zero: -0 + 0 is 0.
 
 import functools
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 NOBODY = -1  # stands for "no body" in an index
 
 Scalar = Int[Array, ""] | int
+T = TypeVar("T")
 
 
 class Rows(Protocol):
@@ -78,6 +79,37 @@ def gather_pair(
 
     first = read(0)
     return jax.lax.fori_loop(1, count, visit, (first, first))
+
+
+def gather(count: int, read: Callable[[Any], T], index: Int[Array, " lane"], first: int = 0) -> T:
+    """Gather one of the rows first .. count - 1, a tree of arrays, by an index that differs by lane: read(index).
+
+    Returns zeros in lanes whose index is not one of these rows, such as NOBODY.
+    """
+
+    def visit(i, picked):
+        return jax.tree.map(lambda x, so_far: jnp.where(index == i, x, so_far), read(i), picked)
+
+    return jax.lax.fori_loop(first, count, visit, jax.tree.map(jnp.zeros_like, read(first)))
+
+
+def put(
+    index: Int[Array, " lane"], *changes: tuple[Ref, Array | float], count: int | None = None, first: int = 0
+) -> None:
+    """Scatter: ref[index[lane], ..., lane] = value for each (ref, value).
+
+    Only rows first .. count - 1 can be written, by default all rows of the first reference; an index of any other row,
+    such as NOBODY, changes nothing.
+    """
+
+    def row(i):
+        def write():
+            for ref, value in changes:
+                ref[i] = jnp.where(index == i, value, ref[i])
+
+        when(anywhere(index == i), write)
+
+    each(changes[0][0].shape[0] if count is None else count, row, first=first)
 
 
 def scatter_add(ref: Ref, *changes: tuple[Int[Array, " lane"], Float[Array, "row lane"]], first: int = 0) -> None:

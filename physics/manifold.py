@@ -28,15 +28,15 @@ from levelproof.physics.vector import Vec, nonzero, where
 
 FLIP_BIAS = 0.01  # m; b must separate this much more than a to become the reference polygon (Jax2D `epsilon`)
 # rad; Jax2D turns edges into normals by rmat(pi / 2) in single precision, whose cosine is -4.371139e-8: its faces lean
-# by that much, so of equally deep corners the one nearer to the face's start is first (docs/physics.md, "Ties")
+# by that much, so of equally deep corners the one nearer to the face's start comes first (docs/physics.md, "Ties")
 TILT = 4.371139e-8
 FAR = 1e30  # m; stands for a vertex or edge that does not exist
 # m; pairs whose bounding boxes are farther apart are skipped. Convex clockwise polygons cannot touch there, whatever
 # the rounding; for degenerate ones the separating axes may report a distant contact, which this margin discards
 MARGIN = 0.01
 
-# found(kind, contact indices, contacts): called with the contacts of each pair that comes near
-Found = Callable[[int, list, list[Contact]], None]
+# listener(kind, contact indices, contacts): called with the contacts of each pair that comes near
+ContactListener = Callable[[int, list, list[Contact]], None]
 
 
 class Outline(NamedTuple):
@@ -65,7 +65,7 @@ class Faces(NamedTuple):
 
 
 def faces(start: Vec) -> Faces:
-    """The faces of clockwise polygons whose vertices are `start`, [vertex, ...]."""
+    """Return the faces of clockwise polygons whose vertices are `start`, [vertex, ...]."""
     edge = start.map(lambda x: jnp.roll(x, -1, axis=0)) - start
     length = edge.norm()
     return Faces(edge, length, Vec(-edge.y, edge.x).scale(1 / nonzero(length)))
@@ -100,16 +100,16 @@ def outline_polygons(block: Block) -> None:
     each(outlines.support.shape[0], one)
 
 
-def find_contacts(block: Block, found: Found) -> None:
-    """Test all pairs that can touch, in the order of `pairs`, and call `found` for those that come near each other."""
+def find_contacts(block: Block, listener: ContactListener) -> None:
+    """Test all pairs that can touch, in the order of `pairs`, and call `listener` for those that come near."""
     pairs = pairs_of(block.model.size)
     n, m = len(pairs.polygon), len(pairs.circle_polygon)
-    each(n, lambda p: _polygons(block, p, n, found))
-    each(2 * n + m, lambda c: _circle_and_polygon(block, c, found), first=2 * n)
-    each(pairs.contacts, lambda c: _circles(block, c, found), first=2 * n + m)
+    each(n, lambda p: _polygons(block, p, n, listener))
+    each(2 * n + m, lambda c: _circle_and_polygon(block, c, listener), first=2 * n)
+    each(pairs.contacts, lambda c: _circles(block, c, listener), first=2 * n + m)
 
 
-def _polygons(block: Block, p: Scalar, count: int, found: Found) -> None:
+def _polygons(block: Block, p: Scalar, count: int, listener: ContactListener) -> None:
     """Test pair p of `count` pairs of polygons."""
     a, b = block.table.a[p], block.table.b[p]
     box = block.scratch.outlines.box
@@ -119,12 +119,12 @@ def _polygons(block: Block, p: Scalar, count: int, found: Found) -> None:
 
     def narrow():
         contacts = _polygon_polygon(_outline(block, a), _outline(block, b))
-        found(POLYGONS, [p, count + p], [c._replace(active=c.active & may) for c in contacts])
+        listener(POLYGONS, [p, count + p], [c._replace(active=c.active & may) for c in contacts])
 
     when(anywhere(may), narrow)
 
 
-def _circle_and_polygon(block: Block, c: Scalar, found: Found) -> None:
+def _circle_and_polygon(block: Block, c: Scalar, listener: ContactListener) -> None:
     a, b = block.table.a[c], block.table.b[c]
     (centre, radius), box = _disc(block, a), block.scratch.outlines.box[b]
     reach = radius + MARGIN
@@ -134,20 +134,20 @@ def _circle_and_polygon(block: Block, c: Scalar, found: Found) -> None:
 
     def narrow():
         contact = _circle_polygon(block, centre, radius, b)
-        found(CIRCLE_POLYGON, [c], [contact._replace(active=contact.active & may)])
+        listener(CIRCLE_POLYGON, [c], [contact._replace(active=contact.active & may)])
 
     when(anywhere(may), narrow)
 
 
-def _circles(block: Block, c: Scalar, found: Found) -> None:
+def _circles(block: Block, c: Scalar, listener: ContactListener) -> None:
     a, b = block.table.a[c], block.table.b[c]
     contact = _circle_circle(*_disc(block, a), *_disc(block, b))
     contact = contact._replace(active=contact.active & may_touch(block.model, a, b))
-    when(anywhere(contact.active), lambda: found(CIRCLES, [c], [contact]))
+    when(anywhere(contact.active), lambda: listener(CIRCLES, [c], [contact]))
 
 
 def _disc(block: Block, i: Scalar) -> tuple[Vec, Array]:
-    """Centre and radius of a circle."""
+    """Return centre and radius of a circle, i being its index among all bodies."""
     return position(block.scratch.bodies.motion[i]), block.model.radius[i - block.model.size.polygons]
 
 
@@ -172,10 +172,10 @@ class Face(NamedTuple):
     end: Vec
 
 
-def _first(found: Bool[Array, "vertex lane"]) -> Int[Array, " lane"]:
-    """Return the index of the first vertex where `found` holds."""
-    number = jnp.arange(len(found), dtype=jnp.int32)[:, None]
-    return jnp.where(found, number, len(found)).min(0)
+def _first(holds: Bool[Array, "vertex lane"]) -> Int[Array, " lane"]:
+    """Return the index of the first vertex where `holds` is true."""
+    number = jnp.arange(len(holds), dtype=jnp.int32)[:, None]
+    return jnp.where(holds, number, len(holds)).min(0)
 
 
 def _pick(x: Float[Array, "vertex lane"], number: Int[Array, " lane"]) -> Float[Array, " lane"]:
@@ -187,7 +187,7 @@ def _pick(x: Float[Array, "vertex lane"], number: Int[Array, " lane"]) -> Float[
 
 
 def _best_face(a: Outline, b: Outline) -> Face:
-    """Find the face of a that separates b the most; the first of equals, as in the reference."""
+    """Find the face of a that separates b the most; the first if several tie, as in the reference."""
     normal, offset = a.normal.map(lambda x: x[:, None]), (b.vertex - a.centre).map(lambda x: x[None])
     separation = normal.dot(offset).min(1) - a.support
     most = separation.max(0)

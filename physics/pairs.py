@@ -38,6 +38,8 @@ class PairKind:
 
 @dataclass(frozen=True)
 class Pairs:
+    """All pairs of a size, by kind."""
+
     polygon: PairKind  # polygon-polygon, two contact points each
     circle_polygon: PairKind  # a is the circle
     circle: PairKind

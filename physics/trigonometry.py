@@ -1,8 +1,9 @@
-"""Sine, cosine and hyperbolic tangent from additions, multiplications and divisions alone.
+"""Sine, cosine, the angle of a vector and hyperbolic tangent from additions, multiplications and divisions alone.
 
 This gives a step the same bits on every machine; the functions of libraries and compilers round differently.
 Sine and cosine use the polynomials of Cephes (S. Moshier, netlib.org/cephes, sinf.c); their error is at most 1e-7 up
-to 8192 rad and 1e-6 up to 1e5 rad. The hyperbolic tangent's error is at most 7 units in the last place.
+to 8192 rad and 1e-6 up to 1e5 rad. The angle uses those of atanf.c; its error is at most 4 units in the last place, and
+the hyperbolic tangent's is at most 7.
 """
 
 import jax.numpy as jnp
@@ -38,6 +39,24 @@ def cos_sin(angle: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Arra
     cos, sin = jnp.where(odd, sine, cosine), jnp.where(odd, cosine, sine)
     cos = jnp.where((quadrant == 1.0) | (quadrant == 2.0), -cos, cos)
     return cos, jnp.where(quadrant >= 2.0, -sin, sin)
+
+
+EIGHTH_TANGENT = 0.41421356237309503  # tan(pi / 8)
+ARCTANGENT = (8.05374449538e-2, -1.38776856032e-1, 1.99777106478e-1, -3.33329491539e-1)
+
+
+def angle_of(x: Float[Array, "..."], y: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the angle of the vector (x, y), rad, from -pi to pi; 0 for the zero vector."""
+    across, up = jnp.abs(x), jnp.abs(y)
+    longer, shorter = jnp.maximum(across, up), jnp.minimum(across, up)
+    slope = shorter / jnp.where(longer == 0.0, 1.0, longer)  # 0 to 1
+    steep = slope > EIGHTH_TANGENT
+    rest = jnp.where(steep, (slope - 1.0) / (slope + 1.0), slope)  # tan(a - pi / 4) beyond pi / 8
+    square = rest * rest
+    angle = rest + rest * square * _polynomial(square, ARCTANGENT) + jnp.where(steep, QUARTER / 2, 0.0)
+    angle = jnp.where(up > across, QUARTER - angle, angle)
+    angle = jnp.where(x < 0.0, 2 * QUARTER - angle, angle)
+    return jnp.where(y < 0.0, -angle, angle)
 
 
 TANH_BOUND = 7.90531110763549805  # beyond it, tanh is +-1 in float32

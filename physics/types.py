@@ -4,7 +4,7 @@ The engine knows bodies, joints and thrusters. It knows nothing of goals, roles 
 
 Layout: a batch of simulated environments, the *lanes*, is the LAST axis of every array, so that each
 operation is one dense loop over lanes. Bodies are numbered polygons first, then circles; polygons
-`0 .. fixed_polygons - 1` are the scenery (floor, left wall, right wall, ceiling) and never move.
+`0 .. FIXED_POLYGONS - 1` are the scenery (floor, left wall, right wall, ceiling) and never move.
 
 Units: metres, radians, seconds, kilograms. Facts about the reference are those of Jax2D 1.0.1
 (`jax2d.sim_state`).

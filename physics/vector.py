@@ -93,7 +93,10 @@ def rows(x: Array, index: Sequence[int]) -> Array:
 
 
 def select(x: Float[Array, "choice *row lane"], index: Int[Array, " lane"]) -> Float[Array, "*row lane"]:
-    """Return x[index[lane], ..., lane] for an index in bounds. Gathers from flat x, which XLA would else transpose."""
+    """Return x[index[lane], ..., lane] for an index in bounds.
+
+    Gathers from flat x, since XLA would transpose an x that is not flat.
+    """
     lanes = max(x.shape[-1], index.shape[-1])  # either may have a single lane, which broadcasts
     x = jnp.broadcast_to(x, (*x.shape[:-1], lanes))
     within = jnp.arange(x[0].size, dtype=jnp.int32).reshape(x.shape[1:])

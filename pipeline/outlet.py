@@ -45,7 +45,7 @@ class Outlet:
 def outlets() -> Iterator[None]:
     """Wrap both standard streams in outlets for the `with` block, and flush them at its end.
 
-    That flush ignores errors: the command itself flushes where it can still report them.
+    That flush ignores errors: the command itself flushes earlier, while it can still report them.
     """
     with ExitStack() as stack:
         for stream, redirect in (sys.stdout, redirect_stdout), (sys.stderr, redirect_stderr):

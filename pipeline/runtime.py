@@ -13,6 +13,7 @@ from typing import Literal
 
 from loky import cpu_count
 
+from levelproof.pipeline.claims import share_compiling
 from levelproof.pipeline.owned import own_folder
 
 CACHE_VARIABLE = "LEVELPROOF_CACHE_DIR"
@@ -24,7 +25,7 @@ XLA_FLAGS = (
 )
 # NPROC and PJRT_NPROC set the size of XLA's pool; numpy's libraries read the others.
 THREADS = ("NPROC", "PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-NO_GPU = "JAX cannot use one here, as it can with levelproof's extra `gpu`"
+NO_GPU = "JAX cannot use one here, which needs levelproof's extra `gpu`"
 LAST_CHECK = "looked"  # file beside the programs, touched when a check begins; programs older than it were readable
 CLAIM_SECONDS = 2.0  # s for which a worker tries to claim a core
 CLAIMS: list[socket.socket] = []  # sockets that mark this process's core as taken
@@ -38,7 +39,6 @@ JAX_SETTINGS = {
     "jax_debug_nans": False,  # diverging worlds contain NaNs
     "jax_debug_infs": False,
 }
-MIN_COMPILE_SECONDS = 0.2  # s; programs that compile faster are not cached
 
 
 def cache_folder() -> Path:
@@ -53,22 +53,24 @@ def cache_folder() -> Path:
         path = Path.home() / "Library" / "Caches" / "levelproof"
     else:
         path = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "levelproof"
-    return own_folder(path, f"delete it, or have {CACHE_VARIABLE} name a folder of your own")
+    return own_folder(path, f"delete it, or set {CACHE_VARIABLE} to a folder of your own")
 
 
-def prepare_jax(core: int | None = None, device: Literal["cpu", "gpu"] | None = None) -> None:
-    """Set this process up to run work units.
+def prepare_jax(core: int | None = None, device: Literal["cpu", "gpu"] | None = None, devices: int = 1) -> None:
+    """Set this process up to run work units, or to train a policy.
 
     Args:
         core: CPU core to pin this process to; None leaves the choice to the system.
         device: "cpu": JAX ignores GPUs; "gpu": JAX uses a GPU if it can; None: JAX_PLATFORMS decides, by default the
             CPU.
+        devices: devices that JAX shows for the CPU, each with a thread of its own.
 
     Raises:
         UserError: see `cache_folder`.
     """
     flags = os.environ.get("XLA_FLAGS", "")
-    os.environ["XLA_FLAGS"] = " ".join([flags, *(flag for flag in XLA_FLAGS if flag not in flags)]).strip()
+    wanted = [*XLA_FLAGS, *[f"--xla_force_host_platform_device_count={devices}"] * (devices > 1)]
+    os.environ["XLA_FLAGS"] = " ".join([flags, *(flag for flag in wanted if flag not in flags)]).strip()
     os.environ.update(dict.fromkeys(THREADS, "1"))
     if core is not None and sys.platform == "linux":  # other systems have no affinity
         for thread in os.listdir("/proc/self/task"):  # all threads of this process; later ones inherit the affinity
@@ -82,12 +84,14 @@ def prepare_jax(core: int | None = None, device: Literal["cpu", "gpu"] | None = 
     for name, value in JAX_SETTINGS.items():
         jax.config.update(name, value)
     jax.config.update("jax_compilation_cache_dir", str(programs))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", MIN_COMPILE_SECONDS)
+    # Even the smallest programs: to load one takes a quarter of the time to compile it
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    share_compiling()
 
 
 def remove_damaged(folder: Path) -> None:
-    """Delete the programs that JAX cannot read, of those that changed since the last check.
+    """Delete cached programs that changed since the last check and that JAX cannot read.
 
     JAX writes a program in place and never replaces one, so a program that a killed process or a full disk left
     half-written would be recompiled, with a warning, at every start.
@@ -115,7 +119,7 @@ def jax_sees_a_gpu() -> bool:
 
 
 def own_cores() -> list[int]:
-    """Return the CPU cores that this process may keep busy; a container's quota may allow fewer than it shows."""
+    """Return CPU cores for this process to use; fewer than a container shows if its CPU quota is lower."""
     return _allowed_cores()[: cpu_count()]
 
 

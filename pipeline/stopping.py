@@ -1,4 +1,4 @@
-"""Ending a command on Ctrl-C or SIGTERM, a batch system's notice: with time to commit, before the system kills it."""
+"""Stopping a command on Ctrl-C or on SIGTERM, which batch systems send before they kill it: it can commit first."""
 
 import os
 import signal
@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from levelproof.pipeline.errors import Exit
 
 GRACE = 20.0  # s after the first signal in which workers commit what they can
-LAST = 28.0  # s after the first signal by which the process has ended; batch systems kill it after 30
+LAST = 28.0  # s from the first signal until this process ends itself; batch systems kill it after 30
 
 
 class Stop:

@@ -11,7 +11,7 @@ import pytest
 from benchmarks import oracle
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.runtime import CACHE_VARIABLE, prepare_jax
-from tests import pace
+from tests import pace, quick
 
 pytest_plugins = ["tests.order"]
 
@@ -22,6 +22,12 @@ MAX_MAPS = 40_000
 # Workers and the commands that tests start inherit the cache folder. Set up before any test touches JAX.
 os.environ.setdefault(CACHE_VARIABLE, str(ROOT / ".pytest_cache" / "levelproof"))
 prepare_jax()
+# Ray starts workers with a niceness of 15: beside two tests that compute they get 4% of the machine, so that their
+# tests would wait for others to end, not for a defect.
+os.environ.setdefault("RAY_worker_niceness", "0")
+# A local Ray makes its process ask for tokens, and so all that the process starts later. A command that asks for them
+# waits for ever for a head that has none.
+os.environ.setdefault("RAY_AUTH_MODE", "disabled")
 # Hypothesis's own clocks fail tests on a slow machine, without a defect.
 hypothesis.settings.register_profile(
     "any machine", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
@@ -43,6 +49,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if "reference" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.campaign)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def compiling(request: pytest.FixtureRequest) -> None:
+    """Compile for modules that run each program briefly without XLA's optimiser."""
+    quick.compile_for(request.node.nodeid)
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -16,6 +16,7 @@ PRODUCT = (*ROOMS, "levelproof")
 OUTSIDE = ("benchmarks", "tests")  # the product imports neither
 BELOW = ("experts", "levelgen", "physics")
 EXPERTS = (
+    "experts.generalist",
     "experts.pool",
     "experts.verdict",
     "experts.training",
@@ -32,20 +33,22 @@ MAY_IMPORT = {
     "levelgen.frames": ("physics",),
     "levelgen.level": ("physics",),
     "levelgen.identity": ("levelgen.level", "physics"),
-    "levelgen.sampling": ("levelgen.identity", "levelgen.level", "physics"),
-    "levelgen.task": ("levelgen.level", "physics"),
+    "levelgen.vmapped": (),
+    "levelgen.sampling": ("levelgen.identity", "levelgen.level", "levelgen.vmapped", "physics"),
+    "levelgen.task": ("levelgen.sampling", "levelgen.level", "levelgen.vmapped", "physics"),
     "levelgen.files": ("levelgen.sampling", "levelgen.task", "levelgen.frames", "levelgen.level", "physics"),
     "levelgen.pictures": ("levelgen.frames", "levelgen.level", "physics"),
     "levelgen": ("levelgen", "physics"),
     # "experts" and "pipeline" alone mean the files beside their rooms
     "experts": ("experts.networks", "experts.search", "levelgen", "physics"),
     "experts.networks": ("experts", "levelgen", "physics"),
+    "experts.generalist": ("experts.networks", "experts", "levelgen", "physics"),
     "experts.witness": ("experts", "levelgen", "physics"),
     "experts.training": ("experts.witness", "experts", "levelgen", "physics"),
     "experts.search": ("experts.witness", "experts", "levelgen", "physics"),
     "experts.verdict": ("experts.training", "experts.search", "experts.witness", "experts", "levelgen", "physics"),
     "experts.pool": ("experts.verdict", "experts.training", "experts.search", "experts.witness", *BELOW),
-    "configs": ("experts", "experts.networks", "experts.search", "levelgen", "physics"),
+    "configs": ("experts", "experts.generalist", "experts.networks", "experts.search", "levelgen", "physics"),
     "pipeline": ("configs",),
     "pipeline.store": ("pipeline", *PIPELINE_BELOW),
     "pipeline.read": ("pipeline.store", "pipeline", *PIPELINE_BELOW),

@@ -15,9 +15,9 @@ ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 LEVELS = 8  # instead of the numbers on a page
 BUDGETS = {"64k": "3k", "128k": "4k", "256k": "5k", "1M": "6k"}  # budgets on a page, and those that run; also folders
-JOBS = ("generate", "regenerate", "plan")
+JOBS = ("generate", "regenerate", "plan", "grow")
 ELSEWHERE = ("levelproof play", "://", "HEAD:", "me/levels")  # servers and other hosts, which tests/pipeline tests
-WITH_WORKERS = ("README", "cluster")  # pages whose jobs start Ray; those of other pages run in this process
+WITH_WORKERS = ("README", "cluster")  # pages whose jobs run on Ray; those of other pages run in this process
 NO_MATCH = "No level", "no trajectories", "holds for none", "too few levels"  # a condition fits none of so few levels
 
 
@@ -25,12 +25,16 @@ def smaller(line: str) -> list[str]:
     """Return the arguments of a command, with budgets and levels that take seconds."""
     for budget, small in BUDGETS.items():
         line = re.sub(rf"\b{budget}\b", small, line)
-    words = [re.sub(r"^levels=.*", f"levels={LEVELS}", word) for word in shlex.split(line, comments=True)[1:]]
+    words = [re.sub(r"^levels=\d.*", f"levels={LEVELS}", word) for word in shlex.split(line, comments=True)[1:]]
     words = words[: words.index(">")] if ">" in words else words  # without a shell's redirection
     unlimited = words[0] == "generate" and not any(word.startswith(("levels=", "level_files=", "-")) for word in words)
     if words[0] == "clone":
         words = [word for word in words if not word.startswith("train.")]
         words += ["train.updates=4", "train.batch=32", "validation=0.5", "where="]
+    if words[0] == "train":
+        words = [word for word in words if not word.startswith("ppo.env")]
+        words += ["ppo.environments=32", "ppo.env_steps=2048", "ppo.minibatches=4"]
+        words += ["where="] if any("data/" in word for word in words) else []
     if words[0] == "evaluate":
         words += ["--levels", str(LEVELS), "--attempts", "2"]
     return words + unlimited * [f"levels={LEVELS}"]
@@ -45,7 +49,8 @@ def run_command(words: list[str], folder: Path, inline: bool) -> None:
     """Run a command in its own process if it starts workers, else in this one; `inline` jobs start none."""
     inline &= words[0] in JOBS
     starts = words[0] in JOBS or "--repair" in words
-    done = run(words, folder) if starts and not inline else here([*words, *["executor=inline"] * inline], folder)
+    executor = [f"executor={'inline' if inline else 'ray'}"] if words[0] in JOBS else []
+    done = (run if starts and not inline else here)([*words, *executor], folder)
     none_fits = done.returncode == 2 and any(text in done.stderr for text in NO_MATCH)
     output = f"{done.stdout[-500:]}{done.stderr[-1500:]}"
     assert done.returncode == 0 or none_fits, f"levelproof {shlex.join(words)}: {output}"
@@ -55,7 +60,7 @@ def run_command(words: list[str], folder: Path, inline: bool) -> None:
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with what pages presuppose: splits, level files, a policy, a folder in the reference's format."""
     folder = tmp_path_factory.mktemp("docs")
-    for size, budget in (("s", "4k"), ("s", "5k"), ("s", "6k"), ("m", "5k"), ("m", "6k")):
+    for size, budget in (("s", "3k"), ("s", "4k"), ("s", "5k"), ("s", "6k"), ("m", "5k"), ("m", "6k")):
         run_command(["generate", f"size={size}", f"budget={budget}", f"levels={LEVELS}"], folder, True)
     run_command(["export", "data/4k/s", "7", "-o", "level.json"], folder, True)
     for name in ("mine", "handmade"):
@@ -73,7 +78,7 @@ def test_commands_of_a_page_run_in_order(page: Path, made: Path, tmp_path: Path)
         for name in re.findall(
             r"data/\w+/\w+|kinetix/\w+/\w+|level\.json|\bmine\b|\bhandmade\b|\bpolicy\b", " ".join(words)
         ):
-            makes = words[0] in ("import", "clone") and f"-o {name}" in " ".join(words)
+            makes = words[0] in ("import", "clone", "train") and f"-o {name}" in " ".join(words)
             if (made / name).exists() and not (tmp_path / name).exists() and not makes:
                 copy = shutil.copytree if (made / name).is_dir() else shutil.copy
                 (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)

@@ -18,6 +18,7 @@ from levelproof.pipeline.exchange.parquet import export_parquet
 from levelproof.pipeline.look.gallery.gallery import SITE
 from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.made import played_split
+from tests.quick import jit_once
 
 ROOT = Path(__file__).parent.parent
 INSIDE = {"physics", "levelgen", "experts", "configs", "pipeline", "benchmarks", "tests"}
@@ -41,7 +42,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     export(split, int(read_manifest(split).level_ids[0]), folder / "level.json")
     export_parquet(split, None, folder / "levels")
     network = NetworkConfig()
-    params = initial_policy(jax.random.key(0), network, levelproof.SIZES["s"])
+    params = jit_once(initial_policy, static_argnums=(1, 2))(jax.random.key(0), network, levelproof.SIZES["s"])
     levelproof.save_policy(folder / "policy", levelproof.Policy(network, params, None, {}))
     return folder
 

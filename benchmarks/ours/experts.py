@@ -23,11 +23,11 @@ def main() -> None:
 
     import jax
 
-    from benchmarks.endless import endless_queue, update_slots
+    from benchmarks.endless import endless_slots, update_slots
     from benchmarks.levels import load_levels
     from benchmarks.solved.variants import REFERENCE
     from levelproof.experts.pool.pool import slot_count
-    from levelproof.experts.training.slots import LevelQueue, Training, empty_slots
+    from levelproof.experts.training.slots import Training
     from levelproof.levelgen.batching import take
     from levelproof.levelgen.task.rules import TaskParams
 
@@ -41,18 +41,12 @@ def main() -> None:
 
     def train(updates: int, batches: list[np.ndarray]) -> list[tuple[Training, float]]:
         """Train fresh experts, batch after batch; return their training states and goals reached."""
-        everyone = jax.device_get(endless_queue(levels, config))
-        return [train_batch(of_batch(everyone, batch), updates) for batch in batches]
+        return [train_batch(batch, updates) for batch in batches]
 
-    def of_batch(queue: LevelQueue, batch: np.ndarray) -> LevelQueue:
-        begun, pending = jax.tree.map(lambda x: x[batch], (queue.begun, queue.pending))
-        fields = take(queue.levels, batch), queue.level_ids[batch], np.arange(len(batch)), np.int32(len(batch))
-        return jax.device_put(LevelQueue(*fields, begun, pending))
-
-    def train_batch(queue: LevelQueue, updates: int) -> tuple[Training, float]:
-        now, goals, ended = empty_slots(slots, queue, config), 0.0, np.zeros(slots)
+    def train_batch(batch: np.ndarray, updates: int) -> tuple[Training, float]:
+        now, goals, ended = endless_slots(take(levels, batch), batch, config), 0.0, np.zeros(slots)
         for _ in range(updates):
-            now, report = update_slots(now, queue, config, rules)
+            now, report = update_slots(now, config, rules)
             before, ended = ended, np.asarray(now.slot.training.progress.episodes)
             goals += float((np.nan_to_num(np.asarray(report.share)) * (ended - before)).sum())
         return now.slot.training, goals

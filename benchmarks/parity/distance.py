@@ -77,7 +77,7 @@ def evolving_gaps(ours: State, theirs: State) -> dict[str, Float[np.ndarray, "..
 
 
 def gap(a: ArrayLike, b: ArrayLike) -> Float[np.ndarray, "..."]:
-    """Return |a - b|: 0 where both are NaN, infinite where one is."""
+    """Return |a - b|: 0 where both are NaN, infinite where only one is."""
     a, b = np.asarray(a), np.asarray(b)
     same = (a == b) | (np.isnan(a) & np.isnan(b))
     with np.errstate(invalid="ignore", over="ignore"):

@@ -190,7 +190,7 @@ def _first_off(ours: State, theirs: State) -> tuple[list[int | None], bool]:
 
 
 def _near_starts(level: Level, action: np.ndarray, lanes: np.ndarray, ours: Outcome) -> list[int]:
-    """Count for each lane how many of COPIES - 1 near starts have another outcome than `ours`."""
+    """Count, for each lane, those of its COPIES - 1 near starts whose outcome differs from `ours`."""
     counts, rng, per_block = [], np.random.default_rng(1), BLOCK // COPIES
     for first in range(0, len(lanes), per_block):
         chosen = lanes[first : first + per_block]

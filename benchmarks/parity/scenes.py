@@ -171,7 +171,7 @@ def limits(level: Level, rng: np.random.Generator) -> Level:
 
 
 def fixed(level: Level, rng: np.random.Generator) -> Level:
-    """Fix every joint at an angle slightly off the present one."""
+    """Fix every joint at an angle slightly off its current one."""
     model = level.model
     rotation = _angle(level.state, model.joint_a, model.joint_b) + rng.normal(0, 0.1, model.joint_a.shape)
     ones = np.ones(model.joint_fixed.shape, bool)

@@ -41,8 +41,8 @@ def main() -> None:
     def train():
         learner, ends = first(keys, levels), []
         for _ in range(args.updates):
-            learner, seen = compiled(learner, levels)
-            ends.append(seen)
+            learner, flags = compiled(learner, levels)
+            ends.append(flags)
         return jax.block_until_ready((learner, ends))
 
     def run() -> dict:

@@ -77,17 +77,17 @@ class Batch:
         self.levels = load_levels(path, self.args.size, 0, self.args.width)
         seeds = np.resize(ids, self.args.width).astype(np.uint32)
         keys = jax.vmap(lambda seed: jax.random.split(jax.random.PRNGKey(seed)))(seeds)
-        self.of_evaluation = keys[:, 1]
-        self.learner, self.seen = self.start_all(keys[:, 0], self.levels), []
+        self.evaluation_keys = keys[:, 1]
+        self.learner, self.flags = self.start_all(keys[:, 0], self.levels), []
 
     def update(self) -> None:
         self.learner, flags = self.update_all(self.learner, self.levels)
-        self.seen.append([np.asarray(x) for x in flags])
+        self.flags.append([np.asarray(x) for x in flags])
 
     def results(self) -> dict[str, np.ndarray]:
         """Return training flags (level, env step, environment), evaluation actions and flags (level, step, attempt)."""
-        trained = (np.concatenate(x, 1) for x in zip(*self.seen, strict=True))
-        evaluated = (np.asarray(x) for x in self.evaluate_all(self.learner, self.levels, self.of_evaluation))
+        trained = (np.concatenate(x, 1) for x in zip(*self.flags, strict=True))
+        evaluated = (np.asarray(x) for x in self.evaluate_all(self.learner, self.levels, self.evaluation_keys))
         names = ("trained_done", "trained_goal", "action", "done", "goal")
         return {name: x[: self.count] for name, x in zip(names, (*trained, *evaluated), strict=True)}
 

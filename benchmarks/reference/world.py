@@ -19,7 +19,7 @@ BATCH = 512  # levels sampled at a time; bounds the sampler's memory
 
 
 def stay_on(core: int | None) -> None:
-    """Run one thread on one core; None: XLA's own threads on all cores. Call it before importing JAX."""
+    """Pin this process to one thread on one core; None: XLA uses all cores. Call it before importing JAX."""
     if core is not None:
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {SINGLE_THREAD}".strip()
         os.environ.update(dict.fromkeys(THREADS, "1"))

@@ -112,8 +112,8 @@ def train(
             steps = round(through * updates) * config.steps_per_update
             report_progress(Progress(unit, (steps, known_before + through, solved)))
 
-        seconds, seen = train_batch(reference, take(levels, batch), ids[batch], updates, report)
-        verdicts = [judged(shown, config, bool(failed[i])) for i, shown in zip(batch, seen, strict=True)]
+        seconds, arrays = train_batch(reference, take(levels, batch), ids[batch], updates, report)
+        verdicts = [judged(shown, config, bool(failed[i])) for i, shown in zip(batch, arrays, strict=True)]
         rows += [row_of(int(ids[i]), verdict, seconds / WIDTH) for i, verdict in zip(batch, verdicts, strict=True)]
         solved += sum(verdict.label is Label.SOLVED for verdict in verdicts)
     steps, evaluated = updates * config.steps_per_update, config.attempts * RECORD_STEPS
@@ -146,15 +146,15 @@ def train_batch(
         report((update + 1) / updates)
     seconds = reference.ask(do="evaluate", out=str(out))["core_seconds"]
     with np.load(out) as file:
-        seen = {name: file[name] for name in file.files}
-    return seconds, [{name: x[i] for name, x in seen.items()} for i in range(count)]
+        arrays = {name: file[name] for name in file.files}
+    return seconds, [{name: x[i] for name, x in arrays.items()} for i in range(count)]
 
 
-def judged(seen: dict[str, Shaped[np.ndarray, "..."]], config: ExpertConfig, failed_by_noop: bool) -> Verdict:
+def judged(arrays: dict[str, Shaped[np.ndarray, "..."]], config: ExpertConfig, failed_by_noop: bool) -> Verdict:
     """Judge a level by the rules for our own experts.
 
     Args:
-        seen: arrays from the reference's process: `trained_done` and `trained_goal` (env step, environment) of
+        arrays: arrays from the reference's process: `trained_done` and `trained_goal` (env step, environment) of
             training; `action` (step, attempt, 6), `done` and `goal` (step, attempt) of the evaluation.
         config: the expert's configuration.
         failed_by_noop: whether green touches red if nothing acts.
@@ -167,7 +167,7 @@ def judged(seen: dict[str, Shaped[np.ndarray, "..."]], config: ExpertConfig, fai
     from levelproof.experts.witness.success import no_success
     from levelproof.experts.witness.witness import succeeds
 
-    done, goal = seen["trained_done"], seen["trained_goal"]
+    done, goal = arrays["trained_done"], arrays["trained_goal"]
     totals = progress.Progress(
         episode_return=jnp.zeros(config.environments),
         best_return=jnp.float32(jnp.nan),  # unknown
@@ -178,11 +178,11 @@ def judged(seen: dict[str, Shaped[np.ndarray, "..."]], config: ExpertConfig, fai
     )
     nothing = jax.tree.map(lambda x: x[0], no_success(1))
     evaluation = judge.Evaluation(
-        np.moveaxis(seen["action"], -1, 1), seen["done"], seen["goal"], totals, nothing, Cause.NONE
+        np.moveaxis(arrays["action"], -1, 1), arrays["done"], arrays["goal"], totals, nothing, Cause.NONE
     )
     witness = next(iter(judge.candidates_of([evaluation], Source.EXPLORATION, config)), None)
-    of_witness = np.argmax(succeeds(seen["done"], seen["goal"]))
-    episodes = int(seen["done"][:, of_witness].sum())
+    of_witness = np.argmax(succeeds(arrays["done"], arrays["goal"]))
+    episodes = int(arrays["done"][:, of_witness].sum())
     return judge.verdict_of(judge.TrainedLevel([], [evaluation]), witness, episodes, config, failed_by_noop)
 
 

@@ -14,7 +14,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from levelproof.experts.networks.layers import HIDDEN_GAIN, LOGITS, POLICY_GAIN, VALUE_GAIN, Dense, orthogonal
+from levelproof.experts.networks.layers import HIDDEN_GAIN, LOGITS, POLICY_GAIN, SUMMARY, VALUE_GAIN, Dense, orthogonal
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.observe.flat import (
     BODY_ROWS,
@@ -41,7 +41,7 @@ class Kind(NamedTuple):
 
     @property
     def moving_rows(self) -> tuple[int, ...]:
-        """Rows that change within a level."""
+        """Rows of the observation that change during an episode."""
         firsts = [self.own_rows + BODY_ROWS * end for end in range(self.ends)] or [0]
         return tuple(first + row for first in firsts for row in DYNAMIC_ROWS)
 
@@ -57,9 +57,9 @@ KINDS = (  # in the order of the flat view
 class Entities(NamedTuple):
     """All entities of a kind: their constant rows, weights and bodies."""
 
-    rows: Float[Array, "row thing level"]  # 0 in moving rows
-    weight: Float[Array, "thing level"]  # in the average; 0 for inactive entities
-    ends: Float[Array, "end thing movable level"]  # one-hot: the movable bodies that each entity is fixed to
+    rows: Float[Array, "row entity level"]  # 0 in moving rows
+    weight: Float[Array, "entity level"]  # in the average; 0 for inactive entities
+    ends: Float[Array, "end entity movable level"]  # one-hot: the movable bodies that each entity is fixed to
 
 
 Constant = tuple[Entities, ...]  # one of each of KINDS; without the level axis for one level
@@ -72,16 +72,16 @@ class Encoder(nn.Module):
     kind: Kind
 
     @nn.compact
-    def __call__(self, things: Entities, moving: Float[Array, "moving thing lane"]) -> Float[Array, "unit lane"]:
+    def __call__(self, entities: Entities, moving: Float[Array, "moving entity lane"]) -> Float[Array, "unit lane"]:
         """`moving` lacks the floor, the first of the polygons, which never moves."""
-        kernel = self.param("kernel", orthogonal(HIDDEN_GAIN), (self.units, len(things.rows)))
+        kernel = self.param("kernel", orthogonal(HIDDEN_GAIN), (self.units, len(entities.rows)))
         bias = self.param("bias", nn.initializers.zeros, (self.units,))
-        constant = kernel @ things.rows + bias[:, None]
+        constant = kernel @ entities.rows + bias[:, None]
         still = constant.shape[1] - moving.shape[1]
         change = jnp.tensordot(rows(kernel.T, self.kind.moving_rows), moving, (0, 0))
         encoded = nn.tanh(constant[:, still:, None] + change)
-        average = (encoded * things.weight[still:, None]).sum(1)
-        return average + (nn.tanh(constant[:, :still]) @ things.weight[:still])[:, None]
+        average = (encoded * entities.weight[still:, None]).sum(1)
+        return average + (nn.tanh(constant[:, :still]) @ entities.weight[:still])[:, None]
 
 
 class EntityTrunk(nn.Module):
@@ -92,15 +92,16 @@ class EntityTrunk(nn.Module):
     gain: float
 
     @nn.compact
-    def __call__(self, constant: Constant, moving: list[Float[Array, "moving thing lane"]]) -> Array:
+    def __call__(self, constant: Constant, moving: list[Float[Array, "moving entity lane"]]) -> Array:
         averages = [
-            Encoder(self.encoding, kind, name=kind.name)(things, of_kind)
-            for kind, things, of_kind in zip(KINDS, constant, moving, strict=True)
-            if things.weight.size
+            Encoder(self.encoding, kind, name=kind.name)(entities, of_kind)
+            for kind, entities, of_kind in zip(KINDS, constant, moving, strict=True)
+            if entities.weight.size
         ]
         x = jnp.concatenate(averages)
         for _ in range(self.depth - 1):
             x = nn.tanh(Dense(self.width, HIDDEN_GAIN)(x))
+        self.sow(*SUMMARY, x)
         return Dense(self.outputs, self.gain)(x)
 
 
@@ -116,17 +117,17 @@ class EntityNetwork(nn.Module):
     def constant(levels: Level) -> Constant:
         """Compute the constants of each level."""
         size, features, bodies = levels.size, level_features(levels), resting_bodies(levels)
-        things, seen, lanes = [], 0, features.shape[-1]
-        for kind, active, (count, width) in zip(KINDS, active_things(levels), tables_of(size), strict=True):
-            block = features[seen : seen + count * width].reshape(count, width, lanes)
+        entities, offset, lanes = [], 0, features.shape[-1]
+        for kind, active, (count, width) in zip(KINDS, active_entities(levels), tables_of(size), strict=True):
+            block = features[offset : offset + count * width].reshape(count, width, lanes)
             one_hot = block[:, kind.own_rows :].reshape(count, kind.ends, size.bodies, lanes)
             at_ends = jnp.einsum("brl,tebl->ertl", bodies, one_hot).reshape(kind.ends * BODY_ROWS, count, lanes)
             gravity = jnp.broadcast_to(features[-1], (1, count, lanes))
             rows = jnp.concatenate([block[:, : kind.own_rows].swapaxes(0, 1), at_ends, gravity])
             weight = active / jnp.maximum(active.sum(0), 1)
-            things.append(Entities(rows, weight, one_hot[:, :, FIXED_POLYGONS:].swapaxes(0, 1)))
-            seen += count * width
-        return tuple(things)
+            entities.append(Entities(rows, weight, one_hot[:, :, FIXED_POLYGONS:].swapaxes(0, 1)))
+            offset += count * width
+        return tuple(entities)
 
     @nn.compact
     def __call__(
@@ -138,7 +139,7 @@ class EntityNetwork(nn.Module):
         return logits, trunk(1, VALUE_GAIN, "value")(constant, of_kinds)[0]
 
 
-def active_things(levels: Level) -> list[Float[Array, "thing level"]]:
+def active_entities(levels: Level) -> list[Float[Array, "entity level"]]:
     """Return 1 for active entities, by kind; the floor stands for all scenery."""
     model, size = levels.model, levels.size
     polygons = jnp.concatenate([model.active[:1], model.active[FIXED_POLYGONS : size.polygons]])
@@ -156,10 +157,10 @@ def resting_bodies(levels: Level) -> Float[Array, "body row level"]:
 
 def moving_things(
     size: Size, constant: Constant, moving: Float[Array, "dynamic lane"]
-) -> list[Float[Array, "moving thing lane"]]:
+) -> list[Float[Array, "moving entity lane"]]:
     """Return the moving rows of all entities except the floor, by kind."""
     bodies = moving.reshape(size.bodies - FIXED_POLYGONS, len(DYNAMIC_ROWS), moving.shape[-1])
     polygons = size.polygons - FIXED_POLYGONS
-    at_ends = [jnp.tensordot(things.ends, bodies, 1) for things in constant[2:]]
+    at_ends = [jnp.tensordot(entities.ends, bodies, 1) for entities in constant[2:]]
     of_kinds = [bodies[None, :polygons], bodies[None, polygons:], *at_ends]
     return [x.swapaxes(1, 2).reshape(x.shape[0] * x.shape[2], x.shape[1], x.shape[3]) for x in of_kinds]

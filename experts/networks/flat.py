@@ -10,7 +10,7 @@ import flax.linen as nn
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from levelproof.experts.networks.layers import HIDDEN_GAIN, LOGITS, POLICY_GAIN, VALUE_GAIN, Dense, orthogonal
+from levelproof.experts.networks.layers import HIDDEN_GAIN, LOGITS, POLICY_GAIN, SUMMARY, VALUE_GAIN, Dense, orthogonal
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.observe.flat import dynamic_features, feature_count, level_features
 from levelproof.physics.types import Size
@@ -61,6 +61,7 @@ class FlatTrunk(nn.Module):
         x = nn.tanh(FirstDense(self.size, self.width, HIDDEN_GAIN)(constant, moving))
         for _ in range(self.depth - 1):
             x = nn.tanh(Dense(self.width, HIDDEN_GAIN)(x))
+        self.sow(*SUMMARY, x)
         return Dense(self.outputs, self.gain)(x)
 
 

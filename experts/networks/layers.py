@@ -11,6 +11,8 @@ from jaxtyping import Array, Float
 from levelproof.levelgen.task.actions import CHOICES
 
 LOGITS = sum(CHOICES)
+# Where networks leave what they know of a lane, [unit, lane], before their logits: a value function starts from it
+SUMMARY = ("intermediates", "known")
 HIDDEN_GAIN, POLICY_GAIN, VALUE_GAIN = 2**0.5, 0.01, 1.0  # of orthogonal initial kernels
 
 

@@ -1,13 +1,14 @@
 """Networks of one policy for all levels: from levels and states to logits, behind one function.
 
-`attention` and `invariant` fit levels of any size, `flat` those of one. The last two are the experts' networks, with
-the constants of each lane's own level in place of one level's.
+All but `flat` fit levels of any size. `invariant` and `flat` are the experts' networks, with the constants of each
+lane's own level in place of one level's.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
+import flax.linen as nn
 import jax
 from flax.typing import VariableDict
 from jaxtyping import Array, Float, Key
@@ -15,12 +16,16 @@ from jaxtyping import Array, Float, Key
 from levelproof.experts.networks.attention import AttentionPolicy
 from levelproof.experts.networks.entity import EntityNetwork, EntityTrunk, moving_things
 from levelproof.experts.networks.flat import FlatNetwork, FlatTrunk
-from levelproof.experts.networks.layers import LOGITS, POLICY_GAIN
+from levelproof.experts.networks.layers import LOGITS, POLICY_GAIN, SUMMARY
+from levelproof.experts.networks.pictures import PixelPolicy
 from levelproof.experts.networks.relations import entity_tables
+from levelproof.experts.networks.transformer import MASKS, TransformerPolicy
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.levelgen.task.environment import ObservationType
+from levelproof.levelgen.task.observe.entities import entities
 from levelproof.levelgen.task.observe.flat import state_features
+from levelproof.levelgen.task.observe.pixels import pixels
 from levelproof.physics.bounds import require
 from levelproof.physics.types import Size, State
 
@@ -31,6 +36,11 @@ class PolicyKind(StrEnum):
     ATTENTION = "attention"  # entities that attend to each other; actuators have logits of their own
     INVARIANT = "invariant"  # the experts' network on a set of entities; their order does not matter
     FLAT = "flat"  # all features in one vector; for levels of one size
+    TRANSFORMER = "transformer"  # the reference's
+    PIXELS = "pixels"  # convolutions on a picture
+
+
+LANE_BY_LANE = (PolicyKind.INVARIANT, PolicyKind.FLAT)  # kinds whose module sees one level at a time
 
 
 @dataclass(frozen=True)
@@ -46,21 +56,34 @@ class NetworkConfig:
         require(self, ("width", "depth", "heads"), 1)
         if self.kind is PolicyKind.ATTENTION and self.width % self.heads:
             raise ValueError(f"width is {self.width}: it must be a multiple of heads = {self.heads}")
+        if self.kind is PolicyKind.TRANSFORMER and self.heads % MASKS:
+            raise ValueError(f"heads is {self.heads}: the transformer's are a multiple of {MASKS}")
 
     @property
     def observation_type(self) -> ObservationType:
         """What the network reads of a state, as an observation of the environment."""
-        flat = self.kind is PolicyKind.FLAT
-        return ObservationType.SYMBOLIC_FLAT if flat else ObservationType.SYMBOLIC_ENTITY
+        match self.kind:
+            case PolicyKind.FLAT:
+                return ObservationType.SYMBOLIC_FLAT
+            case PolicyKind.PIXELS:
+                return ObservationType.PIXELS
+        return ObservationType.SYMBOLIC_ENTITY
+
+    @property
+    def reads_contacts(self) -> bool:
+        """Whether the network reads which bodies touch."""
+        return self.kind is PolicyKind.TRANSFORMER
 
 
 def initial_policy(key: Key[Array, ""], config: NetworkConfig, size: Size) -> VariableDict:
     """Return initial parameters; `size` matters to a flat network only."""
     level = empty_level(size, 1)
-    if config.kind is PolicyKind.ATTENTION:
-        return _attention(config).init(key, entity_tables(level, level.state))
-    trunk, constant, moving = _trunk(config, level, level.state)
-    return trunk.init(key, *_of_one_lane(config, size, *jax.tree.map(lambda x: x[..., 0], (constant, moving))))
+    observation = seen(config, level, level.state)
+    if config.kind in LANE_BY_LANE:
+        observation = _of_one_lane(config, size, *jax.tree.map(lambda x: x[..., 0], observation))
+    else:
+        observation = (observation,)
+    return _module(config, size).init(key, *observation)
 
 
 def policy_logits(
@@ -74,28 +97,51 @@ def policy_logits(
         level: each lane's level, lanes last; its `state` is not read.
         state: each lane's world.
     """
-    if config.kind is PolicyKind.ATTENTION:
-        logits: Any = _attention(config).apply(params, entity_tables(level, state))
-        return logits.T
-    trunk, constant, moving = _trunk(config, level, state)
-
-    def one(constant: Any, moving: Float[Array, " dynamic"]) -> Float[Array, " logit"]:
-        logits: Any = trunk.apply(params, *_of_one_lane(config, level.size, constant, moving))
-        return logits[:, 0]
-
-    return jax.vmap(one, in_axes=-1, out_axes=-1)(constant, moving)
+    return logits_and_summary(params, config, level.size, seen(config, level, state))[0]
 
 
-def _attention(config: NetworkConfig) -> AttentionPolicy:
-    return AttentionPolicy(config.width, config.depth, config.heads)
+def seen(config: NetworkConfig, level: Level, state: State) -> Any:
+    """Return what the network sees in each lane, lanes last. Arguments as `policy_logits`."""
+    match config.kind:
+        case PolicyKind.TRANSFORMER:
+            return entities(level, state)
+        case PolicyKind.PIXELS:
+            return jax.vmap(pixels, in_axes=-1, out_axes=-1)(replace(level, state=state), state)
+        case PolicyKind.FLAT:
+            return FlatNetwork.constant(level), state_features(level, state)
+        case PolicyKind.INVARIANT:
+            return EntityNetwork.constant(level), state_features(level, state)
+    return entity_tables(level, state)
 
 
-def _trunk(config: NetworkConfig, level: Level, state: State) -> tuple[FlatTrunk | EntityTrunk, Any, Array]:
-    """Return the module, and each lane's constants and moving features."""
-    moving, shape = state_features(level, state), (config.width, config.depth)
-    if config.kind is PolicyKind.FLAT:
-        return FlatTrunk(level.size, *shape, LOGITS, POLICY_GAIN), FlatNetwork.constant(level), moving
-    return EntityTrunk(*shape, config.width, LOGITS, POLICY_GAIN), EntityNetwork.constant(level), moving
+def logits_and_summary(
+    params: VariableDict, config: NetworkConfig, size: Size, observation: Any
+) -> tuple[Float[Array, "logit lane"], Float[Array, "unit lane"]]:
+    """Return logits, and what the network knows of each lane before them, from what it has `seen`."""
+    module = _module(config, size)
+
+    def apply(*inputs: Any) -> tuple[Array, Array]:
+        logits, kept = module.apply(params, *inputs, mutable=[SUMMARY[0]])
+        return logits, kept[SUMMARY[0]][SUMMARY[1]][0]  # pyright: ignore
+
+    if config.kind not in LANE_BY_LANE:
+        return apply(observation)
+    one = lambda *lane: jax.tree.map(lambda x: x[:, 0], apply(*_of_one_lane(config, size, *lane)))
+    return jax.vmap(one, in_axes=-1, out_axes=-1)(*observation)
+
+
+def _module(config: NetworkConfig, size: Size) -> nn.Module:
+    shape = config.width, config.depth
+    match config.kind:
+        case PolicyKind.TRANSFORMER:
+            return TransformerPolicy(*shape, config.heads)
+        case PolicyKind.PIXELS:
+            return PixelPolicy(*shape)
+        case PolicyKind.FLAT:
+            return FlatTrunk(size, *shape, LOGITS, POLICY_GAIN)
+        case PolicyKind.INVARIANT:
+            return EntityTrunk(*shape, config.width, LOGITS, POLICY_GAIN)
+    return AttentionPolicy(*shape, config.heads)
 
 
 def _of_one_lane(config: NetworkConfig, size: Size, constant: Any, moving: Float[Array, " dynamic"]) -> tuple[Any, Any]:

@@ -1,8 +1,7 @@
 """A level as tables of entities, each seen relative to the nearest green, blue and red body.
 
-Lanes come first here, because the layers that read these tables are products of large matrices. An entity's features
-are its rows of the symbolic-flat view, those of the bodies that it is fixed to, gravity, and for each of the three
-roles where the nearest such body is and how it moves, in the world's frame and in the entity's own.
+An entity's features are its rows of the symbolic-flat view, those of the bodies that it is fixed to, gravity, and for
+each of the three roles where the nearest such body is and how it moves, in the world's frame and in the entity's own.
 """
 
 from dataclasses import replace
@@ -31,19 +30,19 @@ FAR = 1e6  # m^2, beyond any squared distance in a world
 class EntityTables(NamedTuple):
     """The entities of each kind: polygons (the floor first, without walls and ceiling), circles, joints, thrusters."""
 
-    features: tuple[Float[Array, "lane thing feature"], ...]
-    active: Bool[Array, "lane token"]  # of all kinds, in their order
-    linked: Bool[Array, "lane token token"]  # a body and what is fixed to it, both ways
-    motors: Float[Array, "lane joint entry"]  # 1 where an active, free joint obeys the entry, else 0
-    thrusts: Float[Array, "lane thruster entry"]
+    features: tuple[Float[Array, "feature entity lane"], ...]
+    active: Bool[Array, "token lane"]  # of all kinds, in their order
+    linked: Bool[Array, "token token lane"]  # a body and what is fixed to it, both ways
+    motors: Float[Array, "joint entry lane"]  # 1 where an active, free joint obeys the entry, else 0
+    thrusts: Float[Array, "thruster entry lane"]
 
 
 class Placed(NamedTuple):
-    """Where things are and how they move; lanes last."""
+    """Where entities are and how they move; lanes last."""
 
-    position: Float[Array, "thing 2 lane"]  # m
-    velocity: Float[Array, "thing 2 lane"]  # m/s
-    angle: Float[Array, "thing lane"]  # rad, of the thing's own frame
+    position: Float[Array, "entity 2 lane"]  # m
+    velocity: Float[Array, "entity 2 lane"]  # m/s
+    angle: Float[Array, "entity lane"]  # rad, of the entity's own frame
 
 
 def entity_tables(level: Level, state: State) -> EntityTables:
@@ -60,45 +59,43 @@ def entity_tables(level: Level, state: State) -> EntityTables:
     hinges = _fixed(bodies, a, model.joint_anchor_a, 0.0)
     nozzles = _fixed(bodies, hull, model.thruster_position, model.thruster_rotation)
     tables = (
-        [of_body[polygons], shape[polygons], _seen(level, _at(bodies, polygons))],
-        [of_body[circles], radius, _seen(level, _at(bodies, circles))],
-        [_stacked(joint_rows(level)), _rows_of(a, of_body), _rows_of(b, of_body), _seen(level, hinges)],
-        [_stacked(thruster_rows(level)), _rows_of(hull, of_body), _seen(level, nozzles)],
+        [of_body[polygons], shape[polygons], _relative(level, _at(bodies, polygons))],
+        [of_body[circles], radius, _relative(level, _at(bodies, circles))],
+        [_stacked(joint_rows(level)), _rows_of(a, of_body), _rows_of(b, of_body), _relative(level, hinges)],
+        [_stacked(thruster_rows(level)), _rows_of(hull, of_body), _relative(level, nozzles)],
     )
     free, bound = model.joint_active & ~model.joint_fixed, level.motor_binding
     return EntityTables(
         tuple(_finished(table, model.gravity[1] / GRAVITY_UNIT) for table in tables),
-        _lanes_first(
-            jnp.concatenate([model.active[np.r_[polygons, circles]], model.joint_active, model.thruster_active])
-        ),
-        _lanes_first(_links(size, np.r_[polygons, circles], a + b, hull)),
-        _lanes_first(free[:, None] * _one_hot(bound, MOTOR_BINDINGS)),
-        _lanes_first(model.thruster_active[:, None] * _one_hot(level.thruster_binding, THRUSTER_BINDINGS)),
+        jnp.concatenate([model.active[np.r_[polygons, circles]], model.joint_active, model.thruster_active]),
+        _links(size, np.r_[polygons, circles], a + b, hull),
+        free[:, None] * _one_hot(bound, MOTOR_BINDINGS),
+        model.thruster_active[:, None] * _one_hot(level.thruster_binding, THRUSTER_BINDINGS),
     )
 
 
-def _seen(level: Level, things: Placed) -> Float[Array, "thing column lane"]:
-    """Return the columns that say where the nearest active body of each goal role is, seen from each thing."""
-    cos, sin = jnp.cos(things.angle), jnp.sin(things.angle)
-    columns = [cos, sin, *_in_frame(things.velocity, cos, sin)]
-    offset = level.state.position[None] - things.position[:, None]  # [thing, body, 2, lane]
+def _relative(level: Level, entities: Placed) -> Float[Array, "entity column lane"]:
+    """Return the columns that say where the nearest active body of each goal role is, seen from each entity."""
+    cos, sin = jnp.cos(entities.angle), jnp.sin(entities.angle)
+    columns = [cos, sin, *_in_frame(entities.velocity, cos, sin)]
+    offset = level.state.position[None] - entities.position[:, None]  # [entity, body, 2, lane]
     squared = jnp.square(offset).sum(2)
     for role in GOALS:
         candidate = (level.role == role) & level.model.active
         nearest = _one_hot(jnp.where(candidate, squared, FAR).argmin(1), len(candidate)) * candidate.any(0)
         to, moves = (nearest[:, :, None] * offset).sum(1), jnp.einsum("tbl,bcl->tcl", nearest, level.state.velocity)
-        relative = (moves - things.velocity) * candidate.any(0)
+        relative = (moves - entities.velocity) * candidate.any(0)
         distance = jnp.sqrt(jnp.square(to).sum(1))
         columns += [candidate.any(0) & jnp.ones_like(distance, bool), distance, to[:, 0], to[:, 1]]
         columns += [*_in_frame(to, cos, sin), *_in_frame(relative, cos, sin)]
     return _stacked(columns)
 
 
-def _in_frame(xy: Float[Array, "thing 2 lane"], cos: Array, sin: Array) -> list[Array]:
+def _in_frame(xy: Float[Array, "entity 2 lane"], cos: Array, sin: Array) -> list[Array]:
     return [cos * xy[:, 0] + sin * xy[:, 1], cos * xy[:, 1] - sin * xy[:, 0]]
 
 
-def _fixed(bodies: Placed, at: Float[Array, "thing body lane"], local: Array, turned: Array | float) -> Placed:
+def _fixed(bodies: Placed, at: Float[Array, "entity body lane"], local: Array, turned: Array | float) -> Placed:
     """Place what is fixed to bodies, at `local` in a body's frame and turned by `turned` rad."""
     position, velocity = (_rows_of(at, x) for x in bodies[:2])
     angle = (at * bodies.angle).sum(1)
@@ -121,22 +118,18 @@ def _at(bodies: Placed, index: np.ndarray) -> Placed:
     return Placed(*(x[index] for x in bodies))
 
 
-def _rows_of(at: Float[Array, "thing body lane"], rows: Float[Array, "body row lane"]) -> Array:
+def _rows_of(at: Float[Array, "entity body lane"], rows: Float[Array, "body row lane"]) -> Array:
     return jnp.einsum("tbl,brl->trl", at, rows)
 
 
-def _one_hot(index: Array, count: int) -> Float[Array, "thing count lane"]:
+def _one_hot(index: Array, count: int) -> Float[Array, "entity count lane"]:
     return (index[:, None] == jnp.arange(count)[:, None]).astype(jnp.float32)
 
 
-def _stacked(rows: list[Array]) -> Float[Array, "thing row lane"]:
+def _stacked(rows: list[Array]) -> Float[Array, "entity row lane"]:
     return jnp.stack(jnp.broadcast_arrays(*(row.astype(jnp.float32) for row in rows)), 1)
 
 
-def _finished(parts: list[Array], gravity: Float[Array, " lane"]) -> Float[Array, "lane thing feature"]:
+def _finished(parts: list[Array], gravity: Float[Array, " lane"]) -> Float[Array, "feature entity lane"]:
     columns = [*parts, jnp.broadcast_to(gravity, (parts[0].shape[0], 1, gravity.shape[-1]))]
-    return _lanes_first(jnp.clip(jnp.nan_to_num(jnp.concatenate(columns, 1)), -LIMIT, LIMIT))
-
-
-def _lanes_first(x: Array) -> Array:
-    return jnp.moveaxis(x, -1, 0)
+    return jnp.clip(jnp.nan_to_num(jnp.concatenate(columns, 1)), -LIMIT, LIMIT).swapaxes(0, 1)

@@ -25,6 +25,8 @@ from levelproof.levelgen.task.rules import TaskState
 from levelproof.physics.types import Size, State
 
 WEIGHTS, CONFIG = "policy.safetensors", "config.json"
+BUILTIN = "builtin:"  # before the name of a policy that comes with levelproof
+BUILTIN_AT = Path(__file__).parent / "builtin"
 FORMAT = 1  # of config.json
 
 
@@ -53,6 +55,10 @@ class Policy:
         """What the network reads of a state, as an observation of the environment."""
         return self.network.observation_type
 
+    def can_play(self, size: Size) -> bool:
+        """Return whether it plays levels of this size."""
+        return self.size in (None, size)
+
     def logits(self, level: Level, state: State | TaskState) -> Float[Array, "16 lane"]:
         """Return logits: three for each of four motor entries, then two for each of two thruster entries.
 
@@ -65,7 +71,7 @@ class Policy:
         Raises:
             PolicyError: the policy was trained for another size.
         """
-        if self.size not in (None, level.size):
+        if self.size is not None and not self.can_play(level.size):
             raise PolicyError(
                 f"The policy plays levels of size {name_of(self.size)} only, not {name_of(level.size)}: "
                 "policies with network.kind=attention play any."
@@ -104,11 +110,16 @@ def save_policy(folder: str | os.PathLike[str], policy: Policy) -> None:
 def load_policy(folder: str | os.PathLike[str]) -> Policy:
     """Load the policy that `save_policy` or `levelproof clone` wrote.
 
+    Args:
+        folder: the policy's folder; `builtin:s` names the policy for size s that comes with levelproof.
+
     Raises:
         PolicyError: the folder has no policy, or it is damaged or of a later version.
     """
-    path = Path(folder)
+    path = policy_folder(folder)
     try:
+        if not all((path / name).is_file() for name in (CONFIG, WEIGHTS)):  # to read a pipe would wait
+            raise FileNotFoundError
         config = json.loads((path / CONFIG).read_text())
         if config["format"] != FORMAT:
             raise PolicyError(f"The policy {path} has format {config['format']}, this version reads {FORMAT}: update.")
@@ -119,11 +130,27 @@ def load_policy(folder: str | os.PathLike[str]) -> Policy:
         params = unnamed(wanted, load_file(path / WEIGHTS))
     except FileNotFoundError:
         raise PolicyError(f"There is no policy in {path}: `levelproof clone SPLIT -o {path}` makes one.") from None
-    except (OSError, KeyError, TypeError, ValueError, SafetensorError) as error:
+    except (OSError, KeyError, TypeError, ValueError, RecursionError, SafetensorError) as error:
         if isinstance(error, PolicyError):
             raise
         raise PolicyError(f"The policy in {path} is damaged ({error}): make or copy it again.") from None
     return Policy(network, params, size, config["origin"])
+
+
+def policy_folder(name: str | os.PathLike[str]) -> Path:
+    """Return the folder of a policy, also of one that comes with levelproof.
+
+    Raises:
+        PolicyError: no policy of this name comes with levelproof.
+    """
+    text = os.fspath(name)
+    if not text.startswith(BUILTIN):
+        return Path(text)
+    builtin = sorted(each.parent.name for each in BUILTIN_AT.glob(f"*/{WEIGHTS}"))
+    if text.removeprefix(BUILTIN) not in builtin:
+        names = ", ".join(f"{BUILTIN}{each}" for each in builtin) or "none"
+        raise PolicyError(f"There is no policy {text}: levelproof comes with {names}.")
+    return BUILTIN_AT / text.removeprefix(BUILTIN)
 
 
 def named(tree: Any) -> dict[str, np.ndarray]:

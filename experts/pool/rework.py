@@ -10,8 +10,7 @@ from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.labels import BY_EXPERT, Source
 from levelproof.experts.pool.steady import KEPT, STARTS, steady
 from levelproof.experts.procedure import Procedure
-from levelproof.experts.search.polish import LANES, polish
-from levelproof.experts.search.shorten import Shortened
+from levelproof.experts.search.shorten import LANES, Shortened, polish
 from levelproof.experts.verdict.judge import Witness, repeating
 from levelproof.experts.verdict.portability import PORTABLE, choose
 from levelproof.experts.witness.success import Success
@@ -33,7 +32,7 @@ def rework(
 ) -> tuple[list[Witness | None], Int[np.ndarray, " level"]]:
     """Search around each witness for a better one; return the witnesses and the env steps.
 
-    The better of two survives more replays from perturbed starts; of equals it is the shorter one.
+    The better witness survives more replays from perturbed starts; if several survive equally many, it is the shortest.
 
     Args:
         levels: the levels, on the host.
@@ -51,9 +50,9 @@ def rework(
         candidates = {}
         for block in blocks(len(now), at_once(lanes, IN_CACHE)):
             at = np.array(list(now))[block]
-            found = jax.device_get(program(take(levels, at), level_ids[at], successes([now[i] for i in at.tolist()])))
-            env_steps[at] += found.env_steps  # a level that pads its block counts once
-            for i, *success in zip(at.tolist(), *found.success, strict=True):
+            result = jax.device_get(program(take(levels, at), level_ids[at], successes([now[i] for i in at.tolist()])))
+            env_steps[at] += result.env_steps  # a level that pads its block counts once
+            for i, *success in zip(at.tolist(), *result.success, strict=True):
                 new = repeating(Success(*success), Source.SEARCH)
                 candidates[i] = sorted([now[i], *new], key=lambda witness: witness.steps)
         at = np.array(list(candidates), int)

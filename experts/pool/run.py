@@ -10,9 +10,9 @@ from jaxtyping import Int
 from levelproof.experts.config import RECORD_STEPS, ExpertConfig, Rule
 from levelproof.experts.labels import WITNESSED, Source, Verdict
 from levelproof.experts.ledger import Lap, Ledger, lap
-from levelproof.experts.pool.found import LevelSearch, SearchFindings, joined
+from levelproof.experts.pool.found import SearchFindings, findings_of, joined
 from levelproof.experts.pool.paused import Paused
-from levelproof.experts.pool.pool import NONE_PAUSED, NOTHING_BEGUN, Pool, Submission, Totals
+from levelproof.experts.pool.pool import NONE_PAUSED, NOTHING_BEGUN, Pool, Totals, TrainingJob
 from levelproof.experts.pool.rework import rework
 from levelproof.experts.steps import EnvSteps
 from levelproof.experts.verdict.afresh import attempt
@@ -72,28 +72,25 @@ class TrainingRun:
         new = ~np.isin(self.level_ids[self.left], list(self._paused))
         self._order = np.argsort(
             np.r_[np.flatnonzero(new), np.flatnonzero(~new)]
-        )  # of new levels, then resumed ones, as `left` has them
+        )  # index of each level of `left` among the new levels followed by the resumed ones
         with self.ledger.timing("search"):
             self._searched = self.left[new]
-            self.search = LevelSearch(*self._some(self._searched), pool.searching)
-        self.submission: Submission | None = None  # of levels that need an expert
+            self.search = pool.searching.submit(*self._some(self._searched))
+        self.submission: TrainingJob | None = None  # of levels that need an expert
         self._left_out: set[int] = set()  # ids of levels that other workers label
         self.submit_searched()
 
     def submit_searched(self) -> None:
         """Submit the levels to the pool once their search has ended."""
-        if self.submission is None:
-            with self.ledger.timing("search"):
-                ended = self.search.ended()
-            if ended:
-                self.ledger.take(self.search.ledger, self._searched)
-                self._submit()
-
-    def _submit(self) -> None:
+        if self.submission or self.search.under_way:
+            return
+        with self.ledger.timing("search"):
+            found = findings_of(self.pool.searching.result(self.search))
+        self.ledger.take(self.search.ledger, self._searched)
         some = self.left if self.pool.procedure.stop.rule != Rule.NONE else self.left[:0]
         levels, level_ids = self._some(some)
         among = lambda known: {i: known[one] for i, one in enumerate(level_ids.tolist()) if one in known}
-        found = joined([self.search.found, *(one.found for one in self._paused.values())], self._order)
+        found = joined([found, *(one.found for one in self._paused.values())], self._order)
         self.submission = self.pool.submit(
             levels, level_ids, found, among(self._begun), self._keep, among(self._paused)
         )
@@ -109,12 +106,12 @@ class TrainingRun:
     def unbegun(self) -> list[int]:
         """Ids of levels that wait for their search, or for a slot."""
         if self.submission is None:
-            waiting = self.level_ids[self._searched[self.search.waiting]]
+            waiting = self.search.level_ids[self.pool.searching.waiting(self.search)]
         else:
             waiting = self.submission.level_ids[self.pool.waiting(self.submission)]
         return [level_id for level_id in waiting.tolist() if level_id not in self._paused]
 
-    def paused(self, in_slots: Iterable[tuple[Submission, int, Paused]]) -> dict[int, Paused]:
+    def paused(self, in_slots: Iterable[tuple[TrainingJob, int, Paused]]) -> dict[int, Paused]:
         """Return the run's unfinished experts by level id: its own among `in_slots`, and those that wait."""
         undecided = set(self.undecided)
         waiting = {level_id: paused for level_id, paused in self._paused.items() if level_id in undecided}
@@ -135,7 +132,7 @@ class TrainingRun:
         self._left_out.update(level_ids)
         indices = lambda ids: np.flatnonzero(np.isin(ids, list(self._left_out)))
         if self.submission is None:
-            self.search.withdraw(indices(self.level_ids[self._searched]))
+            self.pool.searching.withdraw(self.search, indices(self.search.level_ids).tolist())
         else:
             self.pool.withdraw(self.submission, indices(self.submission.level_ids).tolist())
 
@@ -174,14 +171,14 @@ class TrainingRun:
         }
         with lap() as took:
             at = self.left[list(policies)]
-            found = attempt(*self._some(at), list(policies.values()), self.pool.config, self.pool.rules)
+            results = attempt(*self._some(at), list(policies.values()), self.pool.config, self.pool.rules)
         self.ledger.add("evaluation", Lap(0.0, took.compiling))
         for level in at:
             self.ledger.put("evaluation", level, took.seconds / len(at))
-        return dict(zip(policies, zip(*(x.tolist() for x in found), strict=True), strict=True))
+        return dict(zip(policies, zip(*(x.tolist() for x in results), strict=True), strict=True))
 
     def _judged(
-        self, submission: Submission, trained: list[TrainedLevel], attempted: Mapping[int, tuple[float, int]]
+        self, submission: TrainingJob, trained: list[TrainedLevel], attempted: Mapping[int, tuple[float, int]]
     ) -> UnitResult:
         config, rules = self.pool.config, self.pool.rules
         kept = np.flatnonzero(~np.isin(self.level_ids, list(self._left_out)))
@@ -255,7 +252,7 @@ def idling(verdict: Verdict, nothing: Int[np.ndarray, "256 6"]) -> Sequence[Witn
     return () if steps is None else (Witness(nothing, Source.NOTHING, steps),)
 
 
-def spent_on(verdicts: list[Verdict], submission: Submission, config: ExpertConfig) -> EnvSteps:
+def spent_on(verdicts: list[Verdict], submission: TrainingJob, config: ExpertConfig) -> EnvSteps:
     """Sum the env steps of levels, and of empty slots."""
     total = lambda name: sum(getattr(verdict, name) for verdict in verdicts)
     return EnvSteps(

@@ -19,11 +19,11 @@ ONE = 65_536  # weight of an entry that was never chosen
 class ReachedStates(NamedTuple):
     """States that were reached: entries of the archive, or new states of lanes."""
 
-    feature: Float[Array, "level thing feature"]  # features that tell states apart (`experts.search.cells`)
-    state: Float[Array, "level thing word"]  # the whole state (`experts.search.rows`)
-    code: UInt16[Array, "level thing step"]  # codes of the actions from the level's start
-    steps: Int[Array, "level thing"]  # number of these actions
-    distance: Float[Array, "level thing"]  # m, gap between green and blue
+    feature: Float[Array, "level entry feature"]  # features that tell states apart (`experts.search.cells`)
+    state: Float[Array, "level entry word"]  # the whole state (`experts.search.rows`)
+    code: UInt16[Array, "level entry step"]  # codes of the actions from the level's start
+    steps: Int[Array, "level entry"]  # number of these actions
+    distance: Float[Array, "level entry"]  # m, gap between green and blue
 
 
 class Archive(NamedTuple):
@@ -48,14 +48,14 @@ def new_archive(start: ReachedStates, config: SearchConfig) -> Archive:
 
 
 def keys_of(
-    feature: Float[Array, "level thing feature"], width: Float[Array, " level"]
-) -> UInt32[Array, "level thing"]:
+    feature: Float[Array, "level entry feature"], width: Float[Array, " level"]
+) -> UInt32[Array, "level entry"]:
     """Return the keys of the states' cells."""
     return jax.vmap(cell_key)(feature, width)
 
 
 def choose(archive: Archive, uniform: Float[Array, "level 3 lane"], config: SearchConfig) -> Int[Array, "level lane"]:
-    """Choose an entry for each lane, novel ones more often; of two draws sometimes the one nearer to the goal."""
+    """Choose an entry for each lane: rarely chosen ones more often, sometimes the nearer to the goal of two draws."""
     weight = jnp.where(archive.used, jnp.maximum(ONE // (1 + archive.visits), 1), 0)
     total = jnp.cumsum(weight, axis=-1)
 
@@ -75,7 +75,7 @@ def visit(archive: Archive, chosen: Int[Array, "level lane"], active: Bool[Array
 
 
 def insert(archive: Archive, new: ReachedStates, valid: Bool[Array, "level lane"], config: SearchConfig) -> Archive:
-    """Insert states of new cells, or reached in fewer env steps; widen the cells if they do not fit."""
+    """Insert states of new cells, or reached in fewer env steps; widen the cells if the archive is full."""
     key = keys_of(new.feature, archive.width)
     slot, fits = jax.vmap(slots_for)(archive.used, archive.key, archive.entry.steps, key, new.steps, valid)
     level = jnp.arange(len(key))[:, None]
@@ -99,7 +99,10 @@ def slots_for(
     steps: Int[Array, " lane"],
     valid: Bool[Array, " lane"],
 ) -> tuple[Int[Array, " lane"], Bool[Array, ""]]:
-    """Assign each lane's state an index in one level's archive (past the end: none); tell whether all new cells fit."""
+    """Return the index of each lane's state in one level's archive (past the end: none), and whether all new cells fit.
+
+    A state has an index if its cell is new and fits, or if it reached a known cell in fewer env steps.
+    """
     nowhere, number = len(used), jnp.arange(len(used))[:, None]
     old = jnp.where(used[:, None] & (known[:, None] == key), number + 1, 0).sum(0) - 1  # -1: new cell
     first = valid & ~beaten(key, steps, valid)
@@ -114,8 +117,8 @@ def slots_for(
 
 
 def beaten(
-    key: UInt32[Array, " thing"], steps: Int[Array, " thing"], valid: Bool[Array, " thing"]
-) -> Bool[Array, " thing"]:
+    key: UInt32[Array, " entry"], steps: Int[Array, " entry"], valid: Bool[Array, " entry"]
+) -> Bool[Array, " entry"]:
     """Return whether another state has the same cell in fewer env steps, or in as many and a lower index."""
     other, number = lambda x: x[:, None], jnp.arange(len(key))
     sooner = (other(steps) < steps) | ((other(steps) == steps) & (other(number) < number))
@@ -123,7 +126,7 @@ def beaten(
 
 
 def widen(archive: Archive, full: Bool[Array, " level"], config: SearchConfig) -> Archive:
-    """Widen the cells of full archives; of entries that then share a cell, keep the one reached in fewest env steps."""
+    """Widen the cells of full archives; if entries then share a cell, keep the one reached in the fewest env steps."""
 
     def wider(archive: Archive) -> tuple:
         width = jnp.where(full, archive.width * config.growth, archive.width)

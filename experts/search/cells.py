@@ -1,4 +1,4 @@
-"""Cells: two states of a level in different cells are both archived."""
+"""Cells, in which states of a level count as one: the archive keeps one state per cell."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,10 +21,10 @@ def features(level: Level, state: State, config: SearchConfig) -> Float[Array, "
     model, moving = level.model, slice(FIXED_POLYGONS, None)
     turns = (model.inverse_inertia > 0) & (model.inverse_mass > 0)
     arm = jnp.sqrt(jnp.where(turns, model.inverse_mass / jnp.where(turns, model.inverse_inertia, 1.0), 0.0))
-    turned, place = state.rotation - level.state.rotation, state.position - level.state.position
+    turned, shift = state.rotation - level.state.rotation, state.position - level.state.position
     angle = turned - TURN * jnp.round(turned / TURN)
     weight = weights(level, config)
-    rows = place[:, 0] * weight, place[:, 1] * weight, angle * arm * weight
+    rows = shift[:, 0] * weight, shift[:, 1] * weight, angle * arm * weight
     return jnp.concatenate([row[moving] for row in rows]).T
 
 
@@ -35,7 +35,7 @@ def weights(level: Level, config: SearchConfig) -> Float[Array, "body lane"]:
     return jnp.where(moves, jnp.where(driven(level) & ~goal, config.driven_weight, 1.0), 0.0)
 
 
-def cell_key(feature: Float[Array, "thing feature"], width: Float[Array, ""]) -> UInt32[Array, " thing"]:
+def cell_key(feature: Float[Array, "entry feature"], width: Float[Array, ""]) -> UInt32[Array, " entry"]:
     """Hash the cell of each state to 32 bits; among so few cells, collisions are negligible."""
     cell = jnp.round(jnp.clip(feature / width, -FARTHEST, FARTHEST)).astype(jnp.int32).astype(jnp.uint32)
     factor = np.random.default_rng(0).integers(2**31, size=cell.shape[-1], dtype=np.uint32) * 2 + 1

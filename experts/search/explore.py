@@ -8,16 +8,15 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, UInt16, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt16, UInt32
 
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.search.archive import Archive, ReachedStates, choose, insert, new_archive, visit
 from levelproof.experts.search.cells import features
 from levelproof.experts.search.config import SearchConfig, StopLimits
 from levelproof.experts.search.near import FAR, gap, goals_of
-from levelproof.experts.search.play import CODES, Arena, Walk, arena, decode, most_steps, play
+from levelproof.experts.search.play import CODES, Arena, Walk, arena, best_lane, decode, most_steps, play
 from levelproof.experts.search.rows import from_rows, to_rows
-from levelproof.experts.witness.success import Success
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import ACTIONS, Level
 from levelproof.levelgen.task.rules import TaskParams
@@ -31,7 +30,7 @@ class Search:
     """State of the search, level axis first, except in `levels`."""
 
     levels: Level  # lane axis last
-    key: Key[Array, " level"]  # of the search's random stream
+    level_ids: Int[Array, " level"]  # seeds of all randomness
     archive: Archive
     env_steps: Int[Array, " level"]  # of all lanes
     grew: Int[Array, " level"]  # env steps when the last cell entered the archive
@@ -69,19 +68,18 @@ def begin(levels: Level, level_ids: Int[Array, " level"], config: SearchConfig, 
         jnp.zeros((count, 1), jnp.int32),
         one(gap(goals_of(levels), levels.state)),
     )
-    key = jax.vmap(lambda level_id: key_for(level_id, Stream.SEARCH))(level_ids)
     none, code = jnp.zeros(count, jnp.int32), jnp.zeros((count, room), jnp.uint16)
     apart = jnp.nan_to_num(start.distance[:, 0], nan=FAR)  # NaN: the world is broken from its start
-    return Search(levels, key, new_archive(start, config), none, none, apart, none, code, none)
+    return Search(levels, level_ids, new_archive(start, config), none, none, apart, none, code, none)
 
 
 def explore(search: Search, config: SearchConfig, rules: TaskParams) -> Search:
     """Search for `config.rounds` rounds; donates `search`. Levels that are done stay unchanged."""
-    return _explore(search, config.ends, config.endless, rules)
+    return explore_rounds(search, config.ends, config.endless, rules)
 
 
 @partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="search")
-def _explore(search: Search, ends: StopLimits, config: SearchConfig, rules: TaskParams) -> Search:
+def explore_rounds(search: Search, ends: StopLimits, config: SearchConfig, rules: TaskParams) -> Search:
     ring = arena(search.levels, config.lanes, config.redrawn)
     step = lambda search, _: (explore_round(search, ring, ends, config, rules), None)
     return jax.lax.scan(step, search, length=config.rounds)[0]
@@ -90,7 +88,7 @@ def _explore(search: Search, ends: StopLimits, config: SearchConfig, rules: Task
 def explore_round(search: Search, ring: Arena, ends: StopLimits, config: SearchConfig, rules: TaskParams) -> Search:
     """Search for one round; `ring` has the levels' lanes."""
     active = under_way(search, ends)
-    chance = jax.vmap(partial(draw, config=config))(search.key, search.env_steps)
+    chance = jax.vmap(partial(draw, config=config))(search.level_ids, search.env_steps)
     bits = jnp.moveaxis(chance.bits, 0, 3).reshape(config.stretch, config.segment, ACTIONS, -1)
     chosen = choose(search.archive, chance.choice, config)
     walk, code = back_to(search, chosen)
@@ -102,9 +100,9 @@ def explore_round(search: Search, ring: Arena, ends: StopLimits, config: SearchC
         before = walk.timestep
         walk, played = play(ring, walk, bits, rules)
         code = written(code, played, before // config.segment)
-        come, valid = reached_by(walk, code, ring, config)
-        archive = insert(archive, come, valid & active[:, None], config)
-        least = jnp.minimum(least, jnp.where(valid, come.distance, jnp.inf).min(-1))
+        states, valid = reached_by(walk, code, ring, config)
+        archive = insert(archive, states, valid & active[:, None], config)
+        least = jnp.minimum(least, jnp.where(valid, states.distance, jnp.inf).min(-1))
         return (archive, walk, code, least), None
 
     carry = visit(search.archive, chosen, active), walk, code, search.gap
@@ -115,7 +113,7 @@ def explore_round(search: Search, ring: Arena, ends: StopLimits, config: SearchC
     code, length = with_success(search.code, search.length, walk, code, active, rules)
     return Search(
         levels=search.levels,
-        key=search.key,
+        level_ids=search.level_ids,
         archive=archive,
         env_steps=env_steps,
         grew=jnp.where(archive.cells > search.archive.cells, env_steps, search.grew),
@@ -127,7 +125,7 @@ def explore_round(search: Search, ring: Arena, ends: StopLimits, config: SearchC
 
 
 def under_way(search: Search, ends: StopLimits) -> Bool[Array, " level"]:
-    """Return which levels are searched on.
+    """Return for which levels the search continues.
 
     These have no success, have env steps left, are not at a rung with too few cells, and have lately come nearer to
     the goal. A level with few cells is hopeless: its episodes end at once, or its actuators move little. And the
@@ -145,9 +143,9 @@ def patient(waited: Int[Array, " level"], patience: Int[Array, ""]) -> Bool[Arra
     return (waited < patience) | (patience == 0)
 
 
-def draw(key: Key[Array, ""], env_steps: Int[Array, ""], config: SearchConfig) -> RoundDraws:
+def draw(level_id: Int[Array, ""], env_steps: Int[Array, ""], config: SearchConfig) -> RoundDraws:
     """Draw all random numbers of one level's round."""
-    one, other = jax.random.split(jax.random.fold_in(key, env_steps))
+    one, other = jax.random.split(jax.random.fold_in(key_for(level_id, Stream.SEARCH), env_steps))
     uniform = jax.random.uniform(one, (5, config.lanes))
     bits = jax.random.bits(other, (config.stretch, config.segment, ACTIONS, config.lanes))
     return RoundDraws(uniform[:3], uniform[3] < config.anew, (uniform[4] * CODES).astype(jnp.uint16), bits)
@@ -179,14 +177,14 @@ def reached_by(
 ) -> tuple[ReachedStates, Bool[Array, "level lane"]]:
     """Return the states of lanes, by level, and which of their episodes continue."""
     by_level = lambda x: x.reshape(-1, config.lanes, *x.shape[1:])
-    come = ReachedStates(
+    states = ReachedStates(
         feature=features(ring.lanes, walk.state, config),
         state=to_rows(walk.state),
         code=code,
         steps=walk.timestep,
         distance=gap(ring.goals, walk.state),
     )
-    return jax.tree.map(by_level, come), by_level(~walk.ended)
+    return jax.tree.map(by_level, states), by_level(~walk.ended)
 
 
 def with_success(
@@ -197,17 +195,8 @@ def with_success(
     active: Bool[Array, " level"],
     rules: TaskParams,
 ) -> tuple[UInt16[Array, "level step"], Int[Array, " level"]]:
-    """Take each level's shortest success of its lanes, if one is in time; return codes and lengths."""
+    """Take the shortest success among each level's lanes, if one is in time; return codes and lengths."""
     in_time = (walk.reached > 0) & (walk.reached <= most_steps(rules))
     steps = jnp.where(in_time, walk.reached, RECORD_STEPS + 1).reshape(len(active), -1)
-    level, lane = jnp.arange(len(active)), jnp.argmin(steps, axis=-1)
-    won = active & (steps[level, lane] <= RECORD_STEPS)
-    best = played.reshape(*steps.shape, -1)[level, lane]
-    return jnp.where(won[:, None], best, code), jnp.where(won, steps[level, lane], length)
-
-
-def success_of(code: UInt16[Array, "level step"], length: Int[Array, " level"]) -> Success:
-    """Decode successes, level first."""
-    code = jnp.pad(code, [(0, 0), (0, max(0, RECORD_STEPS - code.shape[1]))])[:, :RECORD_STEPS]
-    action = decode(jnp.where(jnp.arange(RECORD_STEPS) < length[:, None], code, 0))
-    return Success(jnp.moveaxis(action, 0, -1).astype(jnp.int8), length)
+    won = active & (steps.min(-1) <= RECORD_STEPS)
+    return best_lane(won, jnp.argmin(steps, axis=-1), (played.reshape(*steps.shape, -1), steps), (code, length))

@@ -30,7 +30,7 @@ class Goals(NamedTuple):
 
     green: Shape
     blue: Shape
-    there: Bool[Array, "pair lane"]
+    there: Bool[Array, "pair lane"]  # whether the level has the pair
 
 
 def goals_of(level: Level) -> Goals:
@@ -74,8 +74,8 @@ def _shape(model: Model, body: Int[Array, "pair lane"]) -> Shape:
     return Shape(body, vec(jnp.swapaxes(local, 0, 1)), radius)
 
 
-def _pick(x: Float[Array, "thing *row lane"], number: Int[Array, "pair lane"]) -> Float[Array, "pair *row lane"]:
-    return jnp.stack([select(x, of_lane) for of_lane in number])
+def _pick(x: Float[Array, "entity *row lane"], index: Int[Array, "pair lane"]) -> Float[Array, "pair *row lane"]:
+    return jnp.stack([select(x, of_pair) for of_pair in index])
 
 
 def _in_world(shape: Shape, state: State) -> tuple[Vec, Vec]:
@@ -85,7 +85,7 @@ def _in_world(shape: Shape, state: State) -> tuple[Vec, Vec]:
 
 
 def _beyond(corner: Vec, other: Vec) -> Float[Array, "pair lane"]:
-    """Return the distance of the other's corners from the face that separates most."""
+    """Return the distance of the other body's corners from the face that separates most."""
     outward = faces(corner).outward
     reach = [outward.dot(other.map(lambda x, k=k: x[k]) - corner) for k in range(MAX_VERTICES)]
     return jnp.stack(reach).min(0).max(0)

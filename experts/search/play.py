@@ -4,7 +4,7 @@ Episodes end, and reach the goal, exactly as in `levelgen.task.rules.advance`.
 """
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt16, UInt32
 
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.search.near import Goals, goals_of
+from levelproof.experts.witness.success import Success
 from levelproof.levelgen.batching import repeat
 from levelproof.levelgen.level import ACTIONS, Level, Role
 from levelproof.levelgen.task.actions import CHOICES, action_mask, controls
@@ -22,6 +23,7 @@ from levelproof.physics.step import step
 from levelproof.physics.types import State
 
 CODES = math.prod(CHOICES)  # number of actions
+T = TypeVar("T")
 
 
 def _without() -> UInt16[np.ndarray, "entries code"]:
@@ -98,7 +100,7 @@ def play(
 
 
 def persistent(action: Int[Array, "6 lane"], bits: UInt32[Array, "6 lane"], arena: Arena) -> Int[Array, "6 lane"]:
-    """Resample some entries of the action; one random number decides both whether, and which choice."""
+    """Resample some entries of the action; one random number per entry decides both whether and to which choice."""
     choices = jnp.array(CHOICES, jnp.float32)[:, None]
     uniform = (bits >> 8).astype(jnp.float32) * 2.0**-24
     drawn = jnp.minimum(uniform / arena.redrawn * choices, choices - 1).astype(jnp.int32)
@@ -110,7 +112,7 @@ def act(arena: Arena, walk: Walk, action: Int[Array, "6 lane"], rules: TaskParam
     state, reached, ended, timestep = walk.state, walk.reached, walk.ended, walk.timestep + 1
     driven = controls(arena.lanes, action)
     for _ in range(rules.frame_skip):
-        state = step(arena.lanes.model, state, *driven, rules.physics, seen=False)[0]
+        state = step(arena.lanes.model, state, *driven, rules.physics, with_contacts=False)[0]
         fail = (arena.red & state.contact_active).any(0)
         goal = (arena.blue & state.contact_active).any(0) & ~fail
         reached = jnp.where(goal & ~ended, timestep, reached)
@@ -134,3 +136,21 @@ def decode(code: UInt16[Array, "*lane"]) -> Int[Array, "6 *lane"]:
         rest, entry = jnp.divmod(rest, choices)
         entries.append(entry)
     return jnp.stack(entries[::-1])
+
+
+def code_of(success: Success) -> UInt16[Array, "level 256"]:
+    """Encode the actions of successes."""
+    return encode(jnp.moveaxis(success.action, -1, 0))
+
+
+def success_of(code: UInt16[Array, "level step"], length: Int[Array, " level"]) -> Success:
+    """Decode successes, level first."""
+    code = jnp.pad(code, [(0, 0), (0, max(0, RECORD_STEPS - code.shape[1]))])[:, :RECORD_STEPS]
+    action = decode(jnp.where(jnp.arange(RECORD_STEPS) < length[:, None], code, 0))
+    return Success(jnp.moveaxis(action, 0, -1).astype(jnp.int8), length)
+
+
+def best_lane(better: Bool[Array, " level"], lane: Int[Array, " level"], new: T, old: T) -> T:
+    """Replace each level's old results by those of one lane in `new`, [level, lane, ...], where `better`."""
+    take = lambda new, old: jnp.where(better.reshape(-1, *[1] * (old.ndim - 1)), new[jnp.arange(len(lane)), lane], old)
+    return jax.tree.map(take, new, old)

@@ -1,23 +1,28 @@
-"""Shortening of a success: leave out or hold stretches of it, and keep what reaches the goal sooner."""
+"""Shortening of a success, in rounds: lanes play edits of the shortest success so far, and the shortest edit stays.
 
-from collections.abc import Callable
+`shorten` leaves out or holds stretches, for a few rounds. `polish` also resamples them, until its env steps are spent;
+among edits as short as the success it keeps the one nearest to the goal one step earlier, because that one can become
+a step shorter.
+"""
+
 from functools import partial
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt16
 
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.search.config import SearchConfig
-from levelproof.experts.search.play import Arena, Walk, act, arena, fresh_walk
+from levelproof.experts.search.edit import Draws, draw, edits, shortening, variation
+from levelproof.experts.search.play import Arena, Walk, act, arena, best_lane, code_of, decode, fresh_walk, success_of
 from levelproof.experts.witness.success import Success
-from levelproof.levelgen.identity.keys import Stream, key_for
-from levelproof.levelgen.level import ACTIONS, Level
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.quick import jit_quickly
+from levelproof.levelgen.task.measures import goal_distance
 from levelproof.levelgen.task.rules import TaskParams
 
-MAX_HALVINGS = 6  # stretches range from a whole success to a 64th of it
-T = TypeVar("T")
+LANES = 16  # per level that is polished: few, so that there are many rounds
 
 
 class Shortened(NamedTuple):
@@ -27,16 +32,17 @@ class Shortened(NamedTuple):
     env_steps: Int[Array, " level"]  # of all lanes
 
 
-class Edit(NamedTuple):
-    """A stretch to leave out, then one that holds its first action; each by its first step and length."""
+class Polishing(NamedTuple):
+    """State of polishing, level first."""
 
-    left_out: Int[Array, " lane"]
-    left_out_steps: Int[Array, " lane"]
-    held: Int[Array, " lane"]
-    held_steps: Int[Array, " lane"]
+    code: UInt16[Array, "level step"]  # codes of the success's actions
+    length: Int[Array, " level"]  # of the success, env steps
+    near: Float[Array, " level"]  # m, distance of green and blue one env step before the goal; infinity: unknown
+    env_steps: Int[Array, " level"]  # of all lanes
+    number: Int[Array, ""]  # of rounds done
 
 
-@partial(jax.jit, static_argnames=("config", "rules"))
+@jit_quickly(static_argnames=("config", "rules"))
 def shorten(
     levels: Level, level_ids: Int[Array, " level"], success: Success, config: SearchConfig, rules: TaskParams
 ) -> Shortened:
@@ -52,76 +58,81 @@ def shorten(
         rules: the task's rules.
     """
     ring = arena(levels, config.lanes, config.redrawn)
-    keys = jax.vmap(lambda level_id: jax.random.fold_in(key_for(level_id, Stream.SEARCH), 1))(level_ids)
-    count = len(level_ids)
 
-    def trial(number: Int[Array, ""], so_far: tuple[Success, Array]) -> tuple[Success, Array]:
-        best, env_steps = so_far
-        bits = jax.vmap(lambda key: jax.random.bits(jax.random.fold_in(key, number), (6, config.lanes)))(keys)
-        edits = jax.vmap(drawn)(bits, best.length)
-        nothing = (number == 0) & (jnp.arange(config.lanes) == 0)
-        edits = jax.tree.map(lambda x: jnp.where(nothing, 0, x), edits)
-        action = jax.vmap(edited)(best.action, best.length, edits)
-        length, _ = replayed(ring, action, best.length, rules)
-        lane = jnp.argmin(length, axis=-1)
-        level = jnp.arange(count)
-        shorter = (length[level, lane] < best.length) | (number == 0)
-        kept = jnp.where(shorter[:, None, None], action[level, lane], best.action)
-        steps = jnp.where(shorter, length[level, lane], best.length)
-        return Success(kept, steps), env_steps + config.lanes * best.length
+    def trial(number: Int[Array, ""], now: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        code, length, env_steps = now
+        bits = draw(Draws.SHORTEN, level_ids, number, 6, config.lanes)
+        new = edits(shortening, code, length, bits, ring)
+        new = new.at[:, 0].set(jnp.where(number == 0, code, new[:, 0]))
+        steps, _ = replayed(ring, new, length, rules)
+        shorter = (steps.min(-1) < length) | (number == 0)
+        code, shortest = best_lane(shorter, jnp.argmin(steps, axis=-1), (new, steps), (code, length))
+        return code, shortest, env_steps + config.lanes * length
 
-    best, env_steps = jax.lax.fori_loop(0, config.trials, trial, (success, jnp.zeros(count, jnp.int32)))
-    return Shortened(ended(best.action, jnp.where(best.length > RECORD_STEPS, 0, best.length)), env_steps)
+    start = code_of(success), success.length, jnp.zeros_like(success.length)
+    code, length, env_steps = jax.lax.fori_loop(0, config.trials, trial, start)
+    return Shortened(success_of(code, jnp.where(length > RECORD_STEPS, 0, length)), env_steps)
 
 
-def ended(action: Int[Array, "level 256 6"], length: Int[Array, " level"]) -> Success:
-    """Return successes of these lengths, with zeros after the end."""
-    inside = jnp.arange(RECORD_STEPS) < length[:, None]
-    return Success(jnp.where(inside[:, :, None], action, 0), length)
+@partial(jax.jit, static_argnames=("env_steps", "rules"))
+def polish(
+    levels: Level, level_ids: Int[Array, " level"], success: Success, env_steps: int, rules: TaskParams
+) -> Shortened:
+    """Search for shorter successes until every level has used its env steps, rounded up to whole rounds.
 
+    Args:
+        levels: the levels, lane axis last.
+        level_ids: their ids, the seeds of all randomness.
+        success: a success of each level that replays, level first; length 0: none, so no env step is made.
+        env_steps: env steps per level, all lanes together.
+        rules: the task's rules.
+    """
+    ring = arena(levels, LANES, (1.0,))
 
-def below(bits: UInt32[Array, " lane"], bound: Int[Array, "*lane"]) -> Int[Array, " lane"]:
-    """Map random bits to integers below a bound; 0 if the bound is 0."""
-    return (bits % jnp.maximum(bound, 1).astype(jnp.uint32)).astype(jnp.int32)
+    def active(now: Polishing) -> Bool[Array, " level"]:
+        return (now.length > 1) & (now.env_steps < env_steps)
 
+    def one(now: Polishing) -> Polishing:
+        runs, length = active(now), now.length[:, None]
+        new = edits(variation, now.code, now.length, draw(Draws.POLISH, level_ids, now.number, 10, LANES), ring)
+        steps, near = replayed(ring, new, jnp.where(runs, now.length, 0), rules, measured=True)
+        lane = jnp.argmin(jnp.where(steps == steps.min(-1, keepdims=True), near, jnp.inf), axis=-1)
+        better = (steps < length) | ((steps == length) & (near < now.near[:, None]))
+        better = runs & jnp.take_along_axis(better, lane[:, None], axis=1)[:, 0]
+        near = jnp.where(steps < length, jnp.inf, near)
+        best = best_lane(better, lane, (new, steps, near), (now.code, now.length, now.near))
+        return Polishing(*best, now.env_steps + jnp.where(runs, LANES * now.length, 0), now.number + 1)
 
-def drawn(bits: UInt32[Array, "6 lane"], length: Int[Array, ""]) -> Edit:
-    """Draw random edits: a quarter leave out the beginning, half hold nothing."""
-    stretch = lambda bits: jnp.maximum(length >> below(bits, jnp.int32(MAX_HALVINGS + 1)), 1)
-    first = jnp.where(bits[0] >> 30 == 0, 0, below(bits[1], length))
-    holds = bits[0] >> 31 == 1
-    return Edit(first, stretch(bits[2]), below(bits[3], length), jnp.where(holds, stretch(bits[4]), 0))
-
-
-def edited(action: Int[Array, "256 6"], length: Int[Array, ""], edit: Edit) -> Int[Array, "lane 256 6"]:
-    """Apply an edit per lane; the last action is repeated to the end."""
-    step = jnp.arange(RECORD_STEPS)
-    at = lambda x: x[:, None]
-    step = jnp.where((step >= at(edit.held)) & (step < at(edit.held + edit.held_steps)), at(edit.held), step)
-    step = jnp.where(step >= at(edit.left_out), step + at(edit.left_out_steps), step)
-    return action[jnp.minimum(step, jnp.maximum(length - 1, 0))]
+    none = jnp.zeros_like(success.length)
+    start = Polishing(code_of(success), success.length, jnp.full(none.shape, jnp.inf), none, jnp.int32(0))
+    end = jax.lax.while_loop(lambda now: active(now).any(), one, start)
+    return Shortened(success_of(end.code, end.length), end.env_steps)
 
 
 def replayed(
     ring: Arena,
-    action: Int[Array, "level lane 256 6"],
+    code: UInt16[Array, "level lane 256"],
     most: Int[Array, " level"],
     rules: TaskParams,
-    look: Callable[[Walk, T], T] = lambda _, seen: seen,
-    seen: T = None,
-) -> tuple[Int[Array, "level lane"], T]:
-    """Return env steps from the level's start to the goal; RECORD_STEPS + 1 if it is not reached within `most`.
+    measured: bool = False,
+) -> tuple[Int[Array, "level lane"], Float[Array, "level lane"]]:
+    """Play each lane's actions from its level's start, for at most this many env steps.
 
-    After each env step, `look` folds the walk into `seen`, which is returned as well.
+    Returns:
+        Env steps until the goal, RECORD_STEPS + 1 if it is not reached; and, in lanes that reach it in env step `most`,
+        the distance of green and blue one env step earlier, m; 0 in other lanes, or if not `measured`.
     """
-    count, lanes = action.shape[:2]
-    by_step = jnp.moveaxis(action.reshape(count * lanes, RECORD_STEPS, ACTIONS), 0, -1).astype(jnp.int32)
+    by_step, last = code.reshape(-1, RECORD_STEPS).T, jnp.repeat(most, code.shape[1])
 
-    def step(now: tuple[Walk, T]) -> tuple[Walk, T]:
-        walk = act(ring, now[0], by_step[now[0].timestep[0]], rules)
-        return walk, look(walk, now[1])
+    def step(now: tuple[Walk, Array]) -> tuple[Walk, Array]:
+        walk, near = now
+        walk = act(ring, walk, decode(by_step[walk.timestep[0]]), rules)
+        if measured:  # programs compiled by `jit_quickly` may not multiply floats, as distances do
+            near = jnp.where(walk.timestep == last - 1, goal_distance(ring.lanes, walk.state), near)
+        return walk, near
 
     going = lambda now: (now[0].timestep[0] < most.max()) & ~now[0].ended.all()
-    walk, seen = jax.lax.while_loop(going, step, (fresh_walk(ring.lanes), seen))
-    reached = walk.reached.reshape(count, lanes)
-    return jnp.where((reached > 0) & (reached <= most[:, None]), reached, RECORD_STEPS + 1), seen
+    walk, near = jax.lax.while_loop(going, step, (fresh_walk(ring.lanes), jnp.zeros(len(last))))
+    steps = jnp.where((walk.reached > 0) & (walk.reached <= last), walk.reached, RECORD_STEPS + 1)
+    by_level = lambda x: x.reshape(code.shape[:2])
+    return by_level(steps), by_level(jnp.where(steps == last, near, 0.0))

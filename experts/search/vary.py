@@ -12,22 +12,22 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key, UInt16, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt16, UInt32
 
 from levelproof.experts.search.archive import Archive
 from levelproof.experts.search.config import SearchConfig, StopLimits
+from levelproof.experts.search.edit import Draws, Edit, below, draw, edited, some_of, stretch
 from levelproof.experts.search.explore import NEARER, patient, with_success
 from levelproof.experts.search.near import FAR, gap
-from levelproof.experts.search.play import CODES, WITHOUT, Arena, Walk, act, arena, decode, fresh_walk, most_steps
+from levelproof.experts.search.play import CODES, Arena, Walk, act, arena, decode, fresh_walk, most_steps
 from levelproof.experts.search.rows import from_rows, to_rows
-from levelproof.experts.search.shorten import MAX_HALVINGS, below
-from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import ACTIONS, Level
+from levelproof.levelgen.quick import jit_quickly
 from levelproof.levelgen.task.rules import TaskParams
 
 KEPT = 8  # trajectories per level
 BEYOND = 16  # env steps played beyond the step at which the varied trajectory was nearest
-CHANGES = 2  # maximum number in a variation
+CHANGES = 2  # maximum number of changes in a variation
 LESS_PATIENT = 4  # divides the patience of Go-Explore: variations succeed sooner (docs/tried/cells.md)
 MAX_MOVED = 8  # env steps, maximum shift in time
 
@@ -50,21 +50,13 @@ class Episodes(NamedTuple):
     over: Bool[Array, "level lane"]
 
 
-class Change(NamedTuple):
-    """Random numbers of one variation."""
-
-    parent: UInt32[Array, "2 *lane"]  # two draws, the nearer one is varied
-    number: UInt32[Array, "*lane"]  # bits that say how many changes apply
-    change: UInt32[Array, "change 5 *lane"]
-
-
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Varying:
     """State of the variations, level axis first, except in `levels`."""
 
     levels: Level  # lane axis last
-    key: Key[Array, " level"]  # of the variations' random stream
+    level_ids: Int[Array, " level"]  # seeds of all randomness
     nearest: Approaches
     episodes: Episodes
     env_steps: Int[Array, " level"]  # of all lanes
@@ -83,7 +75,7 @@ def nearest_of(archive: Archive) -> Approaches:
     return first_of(Approaches(jnp.take_along_axis(entry.code, step, axis=-1), distance, entry.steps))
 
 
-@partial(jax.jit, static_argnames=("config", "rules"))
+@jit_quickly(static_argnames=("config", "rules"))
 def begin(
     levels: Level,
     level_ids: Int[Array, " level"],
@@ -100,7 +92,6 @@ def begin(
         config: settings of the search.
         rules: the task's rules.
     """
-    key = jax.vmap(lambda level_id: jax.random.fold_in(key_for(level_id, Stream.SEARCH), 4))(level_ids)
     count, steps = len(level_ids), nearest.code.shape[-1]
     state = to_rows(arena(levels, config.lanes, (1.0,)).lanes.state).reshape(count, config.lanes, -1)
     none, of_lane = jnp.zeros(count, jnp.int32), jnp.zeros((count, config.lanes), jnp.int32)
@@ -109,16 +100,16 @@ def begin(
     )
     episodes = Episodes(so_far, state, of_lane, of_lane, jnp.ones(of_lane.shape, bool))
     code = jnp.zeros((count, steps), jnp.uint16)
-    return Varying(levels, key, nearest, episodes, none, nearest.gap[:, 0], none, code, none)
+    return Varying(levels, level_ids, nearest, episodes, none, nearest.gap[:, 0], none, code, none)
 
 
 def vary(varying: Varying, config: SearchConfig, rules: TaskParams) -> Varying:
     """Vary for `config.rounds` rounds; donates `varying`. Levels that are done stay unchanged."""
-    return _vary(varying, config.ends, config.endless, rules)
+    return vary_rounds(varying, config.ends, config.endless, rules)
 
 
 @partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="varying")
-def _vary(varying: Varying, ends: StopLimits, config: SearchConfig, rules: TaskParams) -> Varying:
+def vary_rounds(varying: Varying, ends: StopLimits, config: SearchConfig, rules: TaskParams) -> Varying:
     ring = arena(varying.levels, config.lanes, (1.0,))
     step = lambda varying, _: (vary_round(varying, ring, ends, config, rules), None)
     return jax.lax.scan(step, varying, length=config.rounds)[0]
@@ -129,11 +120,11 @@ def vary_round(varying: Varying, ring: Arena, ends: StopLimits, config: SearchCo
     active = under_way(varying, ends)
     stays = lambda new, old: jnp.where(active.reshape(-1, *[1] * (old.ndim - 1)), new, old)
     episodes = varying.episodes
-    come = episodes.so_far._replace(gap=jnp.where(episodes.over, episodes.so_far.gap, FAR))
-    nearest = jax.tree.map(stays, first_of(jax.tree.map(together, varying.nearest, come)), varying.nearest)
+    tried = episodes.so_far._replace(gap=jnp.where(episodes.over, episodes.so_far.gap, FAR))
+    nearest = jax.tree.map(stays, first_of(jax.tree.map(together, varying.nearest, tried)), varying.nearest)
 
-    change = jax.vmap(partial(drawn, lanes=config.lanes))(varying.key, varying.env_steps)
-    episodes = renewed(episodes, nearest, change, ring, rules)
+    bits = draw(Draws.VARY, varying.level_ids, varying.env_steps, 3 + 5 * CHANGES, config.lanes)
+    episodes = renewed(episodes, nearest, bits, ring, rules)
     walk, so_far = played(episodes, ring, config, rules)
     by_level = lambda x: x.reshape(*episodes.over.shape, *x.shape[1:])
     state, timestep = by_level(to_rows(walk.state)), by_level(walk.timestep)
@@ -145,7 +136,7 @@ def vary_round(varying: Varying, ring: Arena, ends: StopLimits, config: SearchCo
     closer = active & (nearest.gap[:, 0] < NEARER * varying.gap)
     return Varying(
         levels=varying.levels,
-        key=varying.key,
+        level_ids=varying.level_ids,
         nearest=nearest,
         episodes=Episodes(so_far, state, timestep, episodes.most, over),
         env_steps=env_steps,
@@ -157,7 +148,7 @@ def vary_round(varying: Varying, ring: Arena, ends: StopLimits, config: SearchCo
 
 
 def under_way(varying: Varying, ends: StopLimits) -> Bool[Array, " level"]:
-    """Return which levels are varied on: no success, env steps left, and lately nearer to the goal."""
+    """Return for which levels variations continue: no success, env steps left, and lately nearer to the goal."""
     going = (varying.length == 0) & (varying.env_steps < ends.variations)
     less = -(-ends.patience // LESS_PATIENT)  # rounded up, because 0 means no limit
     return going & patient(varying.env_steps - varying.closed, less)
@@ -169,7 +160,7 @@ def together(one: Array, other: Array) -> Array:
 
 
 def first_of(some: Approaches) -> Approaches:
-    """Return the KEPT nearest trajectories; of several with the same gap the first, if enough others exist."""
+    """Return the KEPT nearest trajectories; of several with the same gap only the first, if enough others exist."""
     order = jnp.argsort(some.gap, axis=-1)
     gaps = jnp.take_along_axis(some.gap, order, axis=-1)
     again = jnp.pad(gaps[:, 1:] == gaps[:, :-1], [(0, 0), (1, 0)])
@@ -180,25 +171,19 @@ def first_of(some: Approaches) -> Approaches:
     return kept._replace(gap=pick(gaps, first))
 
 
-def drawn(key: Key[Array, ""], env_steps: Int[Array, ""], lanes: int) -> Change:
-    """Draw all random numbers of one level's round."""
-    bits = jax.random.bits(jax.random.fold_in(key, env_steps), (3 + 5 * CHANGES, lanes))
-    return Change(bits[:2], bits[2], bits[3:].reshape(CHANGES, 5, lanes))
-
-
-def renewed(episodes: Episodes, nearest: Approaches, change: Change, ring: Arena, rules: TaskParams) -> Episodes:
-    """Replace episodes that are over with variations of the nearest trajectories."""
-    kept = jnp.int32(nearest.gap.shape[1])
-    parent = jax.vmap(lambda bits: jnp.minimum(below(bits[0], kept), below(bits[1], kept)))(change.parent)
+def renewed(
+    episodes: Episodes, nearest: Approaches, bits: UInt32[Array, "level draw lane"], ring: Arena, rules: TaskParams
+) -> Episodes:
+    """Replace episodes that are over with variations of the nearest trajectories; of two draws the nearer is varied."""
+    parent = below(bits[:, :2], nearest.gap.shape[1]).min(1)
     code, steps = (jax.vmap(lambda x, at: x[at])(x, parent) for x in (nearest.code, nearest.steps))
     live = ring.live.T.reshape(*parent.shape, ACTIONS)
-    by_lane = jax.vmap(varied, (0, 0, -1, 0))
-    so_far = Approaches(
-        jax.vmap(by_lane)(code, steps, change, live), jnp.full(steps.shape, FAR, jnp.float32), jnp.zeros_like(steps)
-    )
+    by_lane = jax.vmap(changed, (0, 0, -1, 0))
+    code, none = jax.vmap(by_lane)(code, steps, bits[:, 2:], live), jnp.zeros_like(steps)
+    so_far = Approaches(code, jnp.full(steps.shape, FAR, jnp.float32), none)
     start = to_rows(ring.lanes.state).reshape(episodes.state.shape)
     most = jnp.minimum(steps + BEYOND, most_steps(rules))
-    fresh = Episodes(so_far, start, jnp.zeros_like(steps), most, jnp.zeros_like(episodes.over))
+    fresh = Episodes(so_far, start, none, most, jnp.zeros_like(episodes.over))
     renew = lambda new, old: jnp.where(episodes.over.reshape(*steps.shape, *[1] * (old.ndim - 2)), new, old)
     return jax.tree.map(renew, fresh, episodes)
 
@@ -225,31 +210,22 @@ def played(episodes: Episodes, ring: Arena, config: SearchConfig, rules: TaskPar
     return walk, Approaches(episodes.so_far.code, least.reshape(shape), steps.reshape(shape))
 
 
-def varied(
-    code: UInt16[Array, " step"], steps: Int[Array, ""], change: Change, live: Bool[Array, "6"]
-) -> UInt16[Array, " step"]:
-    """Apply one or more changes before this step: resample a stretch, or shift what follows in time."""
-    first = changed(code, steps, change.change[0], live)
-    for number, bits in enumerate(change.change[1:]):
-        more = (change.number >> number) & 1 == 1
-        first = jnp.where(more, changed(first, steps, bits, live), first)
-    return first
-
-
 def changed(
-    code: UInt16[Array, " step"], steps: Int[Array, ""], bits: UInt32[Array, "5"], live: Bool[Array, "6"]
+    code: UInt16[Array, " step"], steps: Int[Array, ""], bits: UInt32[Array, " draw"], live: Bool[Array, "6"]
 ) -> UInt16[Array, " step"]:
-    """Resample some live entries for a stretch, in half of the cases; else shift what follows, sooner or later."""
-    step, length = jnp.arange(len(code)), jnp.maximum(steps, 1)
-    first = below(bits[0], length)
-    stretch = jnp.maximum(length >> below(bits[1], jnp.int32(MAX_HALVINGS + 1)), 1)
-    after, kind = step >= first, bits[4] & 3
+    """Apply the first change, and each further one if its bit of the first random number is set."""
+    last = len(code) - 1
+    for number, change in enumerate(bits[1:].reshape(CHANGES, 5)):
+        more = edited(code, last, change_of(steps, change, live))
+        code = jnp.where((bits[0] >> (number - 1)) & 1 == 1, more, code) if number else more
+    return code
 
-    moved = jnp.minimum(stretch, 1 + below(bits[4] >> 2, jnp.int32(MAX_MOVED)))
-    sooner, later = jnp.minimum(step + moved, len(code) - 1), jnp.maximum(step - moved, first)
-    code = code[jnp.where(after & (kind == 2), sooner, jnp.where(after & (kind == 3), later, step))]
 
-    entries = (live * (1 << jnp.arange(ACTIONS))).sum() & bits[2].astype(jnp.int32)
-    rest, fresh = jnp.array(WITHOUT)[entries], (bits[3] % CODES).astype(jnp.int32)
-    drawn = fresh.astype(jnp.uint16) - rest[fresh]
-    return jnp.where(after & (step < first + stretch) & (kind < 2), rest[code] + drawn, code)
+def change_of(steps: Int[Array, ""], bits: UInt32[Array, "5"], live: Bool[Array, "6"]) -> Edit:
+    """In half of cases, resample live entries for a stretch; else play the rest of the trajectory sooner or later."""
+    length, kind = jnp.maximum(steps, 1), bits[4] & 3
+    first, some = below(bits[0], length), stretch(bits[1], length)
+    by = jnp.minimum(some, 1 + below(bits[4] >> 2, MAX_MOVED))
+    sooner = jnp.select([kind == 2, kind == 3], [by, -by], 0)
+    resampled = jnp.where(kind < 2, some, 0)
+    return Edit(0, 0, first, sooner, first, resampled, some_of(live, bits[2]), (bits[3] % CODES).astype(jnp.int32))

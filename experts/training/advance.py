@@ -1,8 +1,7 @@
 """Continuous batching: a fixed number of slots, each training or evaluating an expert.
 
-One compiled program, `advance`, advances every slot by a rollout. A decided level leaves its slot, and the next level
-of the queue enters it, on the device. A level's result depends on the level, its id and the configuration alone: not
-on its slot, its neighbours or its time of entry. `slots.Mode` draws a slot's states.
+One compiled program, `advance`, advances every slot by a rollout. A level's result depends on the level, its id and the
+configuration alone: not on its slot, its neighbours or its time of entry. `slots.Mode` draws a slot's states.
 
 An evaluation interrupts the training of its slot and leaves no trace in it.
 """
@@ -17,12 +16,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from levelproof.experts.config import ExpertConfig
-from levelproof.experts.labels import Cause
+from levelproof.experts.objective import advantages
 from levelproof.experts.policy import ActorCritic, network_of
 from levelproof.experts.training import ppo, progress, stop
 from levelproof.experts.training.ppo import LevelConstants, Samples
 from levelproof.experts.training.rollout import Acting, ActionRule, Trajectory, rollout, start
-from levelproof.experts.training.slots import EvaluationState, LevelQueue, Mode, Report, Slot, Slots, Training, lanes_of
+from levelproof.experts.training.slots import EvaluationState, Mode, Report, Slot, Slots, Training, by_slot, lanes_of
 from levelproof.experts.training.stop import StopRules
 from levelproof.experts.witness.success import find, remember
 from levelproof.levelgen.batching import repeat
@@ -43,29 +42,24 @@ def over_slots(function: Callable, *slots: Any) -> Any:
 
 
 @partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="slots")
-def advance(
-    slots: Slots, queue: LevelQueue, config: ExpertConfig, stopping: StopRules, rules: TaskParams
-) -> tuple[Slots, Report]:
-    """Fill empty slots, roll out every slot, then update its expert or record a part of its evaluation.
+def advance(slots: Slots, config: ExpertConfig, stopping: StopRules, rules: TaskParams) -> tuple[Slots, Report]:
+    """Roll out every slot, then update its expert or record a part of its evaluation.
 
     Args:
         slots: state of every slot; donated.
-        queue: levels that wait, and those in slots.
         config: settings of an expert.
         stopping: rules that say when a level leaves.
         rules: the task's rules, with the reward that experts train on.
     """
-    slots = refill(slots, queue, config)
-    slot = slots.slot
-    levels = jax.tree.map(lambda x: x[..., slot.queue_index], queue.levels)
-    keys = jax.vmap(_key)(queue.level_ids[slot.queue_index], slot)
+    slot, levels = slots.slot, slots.levels
+    keys = jax.vmap(_key)(slots.level_ids, slot)
     lanes = repeat(levels, config.environments)
     evaluating = slot.mode == Mode.EVALUATE
 
     trains = repeat(~evaluating, config.environments)
     fresh = repeat(slot.trial.part == 0, config.environments)
-    trial = _where(fresh, _moved_start(lanes, keys, config), slots.trial)
-    acting = _where(trains, slots.acting, trial)
+    training, trial = lanes_of(slots.acting), lanes_of(slots.trial)
+    acting = _where(trains, training, _where(fresh, _moved_start(lanes, keys, config), trial))
 
     network = network_of(levels.size, config)
     manner = _manner(slot, evaluating, config)
@@ -76,9 +70,10 @@ def advance(
     slot, share, mode = over_slots(partial(_follow, network=network, config=config, stopping=stopping), slot, now)
     left = (slot.mode == Mode.EMPTY) & (mode == Mode.EVALUATE)
     evaluated = (mode == Mode.EVALUATE) & (left | slot.trial.solved)
-    after = Slots(slot, _where(trains, acting, slots.acting), acting, slots.taken)
+    training, trial = (by_slot(lanes, config.environments) for lanes in (_where(trains, acting, training), acting))
     early = left & slot.trial.solved & ~slot.trial.final
-    return after, Report(slot.queue_index, mode, share, evaluated, left, early, slots.taken)
+    after = replace(slots, slot=slot, acting=training, trial=trial)
+    return after, Report(mode, share, evaluated, left, early)
 
 
 @partial(jax.jit, donate_argnames="slots")
@@ -87,43 +82,12 @@ def train_on(slots: Slots, stays: Bool[Array, " slot"], stopping: StopRules) -> 
     slot = slots.slot
     course, deadline = stop.steady_on(slot.training.course, slot.deadline, stopping)
     keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(stays, a, b), new, old)
-    return slots._replace(
-        slot=slot._replace(
-            mode=keep(jnp.full_like(slot.mode, Mode.TRAIN), slot.mode),
-            deadline=keep(deadline, slot.deadline),
-            training=slot.training._replace(course=keep(course, slot.training.course)),
-        )
+    slot = slot._replace(
+        mode=keep(jnp.full_like(slot.mode, Mode.TRAIN), slot.mode),
+        deadline=keep(deadline, slot.deadline),
+        training=slot.training._replace(course=keep(course, slot.training.course)),
     )
-
-
-def refill(slots: Slots, queue: LevelQueue, config: ExpertConfig) -> Slots:
-    """Move the next levels of the queue into empty slots.
-
-    An expert whose training has stopped for good is only evaluated; so is one that was paused during an evaluation.
-    """
-    free = slots.slot.mode == Mode.EMPTY
-    number = slots.taken + jnp.cumsum(free, dtype=jnp.int32) - 1
-    takes, index = free & (number < queue.come), queue.order[number % queue.capacity]
-
-    def fill() -> tuple[Slot, Acting]:
-        begun = jax.tree.map(lambda x: x[index], queue.begun)
-        choose = lambda new, old: jnp.where(takes.reshape(-1, *[1] * (old.ndim - 1)), new, old)
-        put = lambda new, old: jax.tree.map(choose, new, old)
-        due, final, deadline = jax.tree.map(lambda x: x[index], queue.pending)
-        final, trial = final | (begun.training.course.over != Cause.NONE), slots.slot.trial
-        slot = slots.slot._replace(
-            mode=put(jnp.where(due | final, Mode.EVALUATE, Mode.TRAIN), slots.slot.mode),
-            queue_index=put(index, slots.slot.queue_index),
-            deadline=put(deadline, slots.slot.deadline),
-            training=put(begun.training, slots.slot.training),
-            trial=trial._replace(
-                part=put(jnp.zeros_like(index), trial.part), due=put(due, trial.due), final=put(final, trial.final)
-            ),
-        )
-        return slot, _where(repeat(takes, config.environments), lanes_of(begun.acting), slots.acting)
-
-    slot, acting = jax.lax.cond(takes.any(), fill, lambda: (slots.slot, slots.acting))
-    return Slots(slot, acting, slots.trial, slots.taken + takes.sum(dtype=jnp.int32))
+    return replace(slots, slot=slot)
 
 
 class _RolloutData(NamedTuple):
@@ -140,6 +104,26 @@ class _RolloutData(NamedTuple):
     own: Bool[Array, " environment"]  # as `ActionRule.own`
 
 
+def sample_rows(
+    trajectory: Trajectory,
+    last_value: Float[Array, "slot environment"],
+    rehearsing: Bool[Array, " lane"],
+    config: ExpertConfig,
+) -> Float[Array, "slot sample column"]:
+    """Compute advantages; return the samples of every slot as `ppo.as_rows` lays them out, slots first."""
+    advantage = advantages(trajectory.value, trajectory.reward, trajectory.done, last_value, config)
+    rehearsed = jnp.broadcast_to(rehearsing.reshape(trajectory.value.shape[1:]), trajectory.value.shape)
+    samples = Samples(
+        trajectory.moving,
+        trajectory.action,
+        trajectory.log_probability,
+        trajectory.value,
+        advantage,
+        rehearsed.astype(jnp.float32),
+    )
+    return jax.vmap(ppo.as_rows, in_axes=-2)(samples)
+
+
 def _split(
     network: ActorCritic,
     levels: Level,
@@ -149,24 +133,17 @@ def _split(
     manner: ActionRule,
     config: ExpertConfig,
 ) -> _RolloutData:
-    """Split a rollout by slot, slots first; compute advantages."""
-    seen = trajectory
-    advantage = ppo.advantages(seen.value, seen.reward, seen.done, last_value, config)
-    rehearsed = jnp.broadcast_to(manner.rehearsing.reshape(seen.value.shape[1:]), seen.value.shape)
-    samples = Samples(
-        seen.moving, seen.action, seen.log_probability, seen.value, advantage, rehearsed.astype(jnp.float32)
-    )
-    rows = jax.vmap(ppo.as_rows, in_axes=-2)(samples)
+    """Split a rollout by slot, slots first."""
     by_slot = lambda x: jnp.moveaxis(x, -2, 0)
     return _RolloutData(
         jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), LevelConstants(network.constant(levels), action_mask(levels))),
         keys,
-        rows,
-        by_slot(seen.action.astype(jnp.int8)),
-        by_slot(seen.reward),
-        by_slot(seen.done),
-        by_slot(seen.goal),
-        by_slot(seen.timestep),
+        sample_rows(trajectory, last_value, manner.rehearsing, config),
+        by_slot(trajectory.action.astype(jnp.int8)),
+        by_slot(trajectory.reward),
+        by_slot(trajectory.done),
+        by_slot(trajectory.goal),
+        by_slot(trajectory.timestep),
         manner.own.reshape(-1, config.environments),
     )
 
@@ -219,7 +196,7 @@ def _collect(slot: Slot, now: _RolloutData, config: ExpertConfig, stopping: Stop
     keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(ended, a, b), new, old)
     mode = jnp.where(leaves, Mode.EMPTY, Mode.TRAIN)
     training = slot.training._replace(course=keep(course, slot.training.course))
-    return Slot(keep(mode, slot.mode), slot.queue_index, keep(deadline, slot.deadline), training, trial)
+    return Slot(keep(mode, slot.mode), keep(deadline, slot.deadline), training, trial)
 
 
 def _key(level_id: Int[Array, ""], slot: Slot) -> Key[Array, ""]:

@@ -1,7 +1,4 @@
-"""Proximal policy optimisation of one expert, on the trajectory of one rollout; independent of physics.
-
-Schulman et al. 2017 (arXiv:1707.06347) with clipped values and per-minibatch normalised advantages.
-"""
+"""Proximal policy optimisation of one expert, on the trajectory of one rollout; independent of physics."""
 
 from typing import Any, NamedTuple
 
@@ -11,10 +8,9 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from levelproof.experts.config import ExpertConfig
-from levelproof.experts.policy import ActorCritic, Constant, Params, entropy, forward, initial, log_probability
+from levelproof.experts.objective import normalised, terms
+from levelproof.experts.policy import ActorCritic, Constant, Params, forward, initial
 from levelproof.levelgen.task.actions import CHOICES
-
-ADVANTAGE_EPSILON = 1e-8
 
 
 class TrainState(NamedTuple):
@@ -55,44 +51,24 @@ def init(key: Key[Array, ""], network: ActorCritic, constant: Constant, config: 
     return TrainState(params, optimiser(config).init(params))
 
 
-def advantages(
-    value: Float[Array, "time ..."],
-    reward: Float[Array, "time ..."],
-    done: Array,
-    last_value: Float[Array, "..."],
-    config: ExpertConfig,
-) -> Float[Array, "time ..."]:
-    """Estimate generalised advantages (Schulman et al. 2016, arXiv:1506.02438)."""
-
-    def back(carry, now):
-        advantage, next_value = carry
-        value, reward, alive = now
-        surprise = reward + config.discount * next_value * alive - value
-        advantage = surprise + config.discount * config.gae_lambda * alive * advantage
-        return (advantage, value), advantage
-
-    start = (jnp.zeros_like(last_value), last_value)
-    _, estimates = jax.lax.scan(back, start, (value, reward, 1.0 - done), reverse=True)
-    return estimates
-
-
 def loss(
     params: Params, network: ActorCritic, constants: LevelConstants, minibatch: Samples, config: ExpertConfig
 ) -> Float[Array, ""]:
-    """Sum the minibatch means of clipped surrogate, clipped value error, imitation and entropy bonus."""
+    """Sum the weighted minibatch means of clipped surrogate, clipped value error, imitation and entropy bonus."""
     logits, value = forward(network, params, constants.features, minibatch.moving)
-    live = constants.live[:, None]
-    log_prob = log_probability(logits, minibatch.action, live)  # type: ignore[arg-type]
-    ratio = jnp.exp(log_prob - minibatch.log_probability)
-    gain = (minibatch.advantage - minibatch.advantage.mean()) / (minibatch.advantage.std() + ADVANTAGE_EPSILON)
-    clipped_ratio = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
-    surrogate = jnp.minimum(ratio * gain, clipped_ratio * gain).mean()
-
-    target = minibatch.value + minibatch.advantage
-    near = minibatch.value + jnp.clip(value - minibatch.value, -config.clip, config.clip)
-    error = 0.5 * jnp.maximum(jnp.square(value - target), jnp.square(near - target)).mean()
-    likely = config.imitation_weight * (minibatch.rehearsed * log_prob).mean()
-    return config.value_weight * error - surrogate - likely - config.entropy_weight * entropy(logits, live).mean()
+    now = terms(
+        logits,
+        value,
+        minibatch.action,
+        constants.live[:, None],
+        minibatch.log_probability,
+        minibatch.value,
+        minibatch.advantage,
+        normalised(minibatch.advantage),
+        config.clip,
+    )
+    likely = config.imitation_weight * (minibatch.rehearsed * now.log_probability).mean()
+    return config.value_weight * now.value_error - now.surrogate - likely - config.entropy_weight * now.entropy
 
 
 def update(
@@ -123,7 +99,7 @@ def shuffled(key: Key[Array, ""], config: ExpertConfig) -> Int[Array, " sample"]
     """Shuffle an update's samples so that every run of `environments` samples has one of each environment.
 
     Env steps are permuted once, then shifted by a random offset in each environment; environments are permuted too.
-    So `horizon + environments` numbers are sorted instead of all samples, which would take a seventh of the update.
+    So `horizon + environments` numbers are sorted; sorting all samples would take a seventh of the update's time.
     """
     by_time, by_environment, by_shift = jax.random.split(key, 3)
     times = jnp.argsort(jax.random.bits(by_time, (config.horizon,)))

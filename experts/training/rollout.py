@@ -34,6 +34,12 @@ class ActionRule(NamedTuple):
     rehearsing: Bool[Array, " lane"]  # take the action of `rehearsal` at the episode's env step
     rehearsal: Int[Array, "256 6 level"]
 
+    @staticmethod
+    def sampling(lanes: int, levels: int) -> "ActionRule":
+        """Return the rule by which every lane samples."""
+        no = jnp.zeros(lanes, bool)
+        return ActionRule(no, jnp.zeros(lanes), no, jnp.zeros((1, len(CHOICES), levels), jnp.int8))
+
     @property
     def own(self) -> Bool[Array, " lane"]:
         """Whether the expert alone chooses every action of the lane."""
@@ -113,8 +119,8 @@ def rollout(
         log_probs = log_probability(logits, action, live)
         after, outcome = task.step(lanes, world, action, rules)
         played, log_probs, reward, done, goal, timestep = map(per_level, (action, log_probs, *outcome, world.timestep))
-        seen = Trajectory(moving, played, log_probs, value, reward, done, goal, timestep)
-        return Acting(after, jnp.where(outcome.done, 0, action)), seen
+        trajectory = Trajectory(moving, played, log_probs, value, reward, done, goal, timestep)
+        return Acting(after, jnp.where(outcome.done, 0, action)), trajectory
 
     acting, trajectory = jax.lax.scan(act, acting, jnp.arange(steps))
     return acting, trajectory, look(acting.world)[2]

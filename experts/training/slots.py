@@ -1,8 +1,6 @@
-"""State of continuous batching: slots, each training or evaluating an expert, and the queue before them.
+"""Slots, each training or evaluating an expert; `experts.training.advance` advances them."""
 
-`experts.training.advance` advances it.
-"""
-
+from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
 from typing import Any, NamedTuple
@@ -13,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from levelproof.experts.config import RECORD_STEPS, ExpertConfig
+from levelproof.experts.labels import Cause
 from levelproof.experts.policy import Constant, network_of
 from levelproof.experts.training import ppo, progress, stop
 from levelproof.experts.training.ppo import TrainState
@@ -23,6 +22,7 @@ from levelproof.experts.witness.success import Success
 from levelproof.levelgen.batching import repeat
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import Level
+from levelproof.levelgen.quick import jit_quickly
 from levelproof.levelgen.task.actions import CHOICES
 
 
@@ -93,49 +93,34 @@ class EvaluationState(NamedTuple):
 
 
 class Slot(NamedTuple):
-    """One slot. In `Slots` every array has the slot axis first."""
+    """One slot, without its lanes. In `Slots` every array has the slot axis first."""
 
     mode: Int[Array, ""]
-    queue_index: Int[Array, ""]  # of the level in the queue
     deadline: Int[Array, ""]  # updates before the final evaluation
     training: Training
     trial: EvaluationState
 
 
-class Slots(NamedTuple):
-    """All slots, with the lanes of their experts."""
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Slots:
+    """All slots, slot axis first, except in `levels`; a slot of zeros is empty."""
 
+    levels: Level  # slot axis last
+    level_ids: Int[Array, " slot"]
     slot: Slot
-    acting: Acting  # lanes of training, slot by slot
-    trial: Acting  # lanes of evaluation, slot by slot
-    taken: Int[Array, ""]  # total number of levels that have left the queue
-
-
-class LevelQueue(NamedTuple):
-    """Levels that wait, and those in slots. A level keeps its index, any free one, until it leaves its slot."""
-
-    levels: Level  # [..., index]
-    level_ids: Int[Array, " index"] | Int[np.ndarray, " index"]
-    order: Int[Array, " number"] | Int[np.ndarray, " number"]  # indices of levels in order of arrival, modulo capacity
-    come: Int[Array, ""] | np.int32  # total number of levels that have arrived
-    begun: ExpertState  # their experts, index first
-    pending: Pending  # index first
-
-    @property
-    def capacity(self) -> int:
-        return len(self.level_ids)
+    acting: Acting  # of training, [slot, ..., environment]
+    trial: Acting  # of evaluation
 
 
 class Report(NamedTuple):
     """Report of one call of `advance`, by slot."""
 
-    queue_index: Int[Array, " slot"]  # of the level in the queue
     mode: Int[Array, " slot"]  # during the call
     share: Float[Array, " slot"]  # share of a training slot's finished episodes that reached the goal
     evaluated: Bool[Array, " slot"]  # an evaluation ended and solved the level, or the level left
     left: Bool[Array, " slot"]
     early: Bool[Array, " slot"]  # it left solved, before its final evaluation
-    taken: Int[Array, ""]  # total number of levels that have left the queue
 
 
 @partial(jax.jit, static_argnames="config")
@@ -150,19 +135,26 @@ def begin(levels: Level, level_ids: Int[Array, " level"], success: Success, conf
         return Training(train_state, progress.start(lanes), stop.begin(), success, recent)
 
     experts = jax.vmap(training, in_axes=(0, -1, 0))(level_ids, network.constant(levels), success)
-    return ExpertState(experts, _by_slot(start(repeat(levels, lanes)), lanes))
+    return ExpertState(experts, by_slot(start(repeat(levels, lanes)), lanes))
 
 
-@partial(jax.jit, static_argnames=("count", "config"))
-def empty_slots(count: int, queue: LevelQueue, config: ExpertConfig) -> Slots:
-    """Return slots without levels."""
-    blank = lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype)
-    training, acting = jax.tree.map(blank, queue.begun)
-    rows, zeros, no = config.record_rollouts * config.horizon, jnp.zeros(count, jnp.int32), jnp.zeros(count, bool)
+@jit_quickly(static_argnames="config")
+def slots_of(
+    levels: Level, level_ids: Int[Array, " level"], experts: ExpertState, pending: Pending, config: ExpertConfig
+) -> Slots:
+    """Return slots in which these experts continue, level axis first.
+
+    An expert whose training has stopped for good is only evaluated; so is one that was paused during an evaluation.
+    """
+    count, rows = len(level_ids), config.record_rollouts * config.horizon
+    due, final, deadline = map(jnp.asarray, pending)
+    final |= experts.training.course.over != Cause.NONE
+    mode = jnp.where(due | final, jnp.int32(Mode.EVALUATE), jnp.int32(Mode.TRAIN))
     action = jnp.zeros((count, rows, len(CHOICES), config.attempts), jnp.int8)
-    trial = EvaluationState(zeros, no, no, no, action, *jnp.zeros((2, count, rows, config.environments), bool))
-    acting = lanes_of(acting)
-    return Slots(Slot(zeros, zeros, zeros, training, trial), acting, acting, jnp.int32(0))
+    done, goal = jnp.zeros((2, count, rows, config.environments), bool)
+    trial = EvaluationState(jnp.zeros_like(mode), due, final, jnp.zeros_like(final), action, done, goal)
+    slot = Slot(mode, deadline, experts.training, trial)
+    return Slots(levels, level_ids, slot, experts.acting, experts.acting)
 
 
 def lanes_of(tree: Any) -> Any:
@@ -170,7 +162,7 @@ def lanes_of(tree: Any) -> Any:
     return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], x.shape[0] * x.shape[-1]), tree)
 
 
-def _by_slot(tree: Any, environments: int) -> Any:
+def by_slot(tree: Any, environments: int) -> Any:
     """Reshape [..., lane] to [slot, ..., environment]."""
     apart = lambda x: x.reshape(*x.shape[:-1], x.shape[-1] // environments, environments)
     return jax.tree.map(lambda x: jnp.moveaxis(apart(x), -2, 0), tree)

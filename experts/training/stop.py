@@ -86,9 +86,9 @@ def after_update(
     evaluate = rules.evaluates & worth_it
     at_rung = rules.halves & is_rung(updates, rules.first_rung)
     reached = progress.first_success != NEVER
-    moves = usable | reached | (progress.best_return >= course.rung_return + rules.gain)
+    promising = usable | reached | (progress.best_return >= course.rung_return + rules.gain)
     fruitless = rules.halves & ~reached & (updates >= rules.fruitless)
-    stopped = [progress.diverged != NEVER, at_rung & ~moves, fruitless]
+    stopped = [progress.diverged != NEVER, at_rung & ~promising, fruitless]
     over = jnp.select(stopped, [jnp.int8(x) for x in (Cause.DIVERGED, Cause.RUNG, Cause.FRUITLESS)], jnp.int8(0))
     rung_return = jnp.where(at_rung, progress.best_return, course.rung_return)
     course = course._replace(updates=updates, rung_return=rung_return, over=over)

@@ -3,6 +3,7 @@
 Training ends with an evaluation selected for its successes, so that evaluation's success rate is biased upwards.
 """
 
+import math
 from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
@@ -19,7 +20,6 @@ from levelproof.experts.verdict.portability import IN_CACHE
 from levelproof.levelgen.batching import at_once, blocks, repeat, take
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.task.actions import CHOICES
 from levelproof.levelgen.task.rules import TaskParams
 
 PART = 16  # env steps between checks whether all attempts have ended
@@ -59,30 +59,28 @@ def attempt(
     parts = [AttemptResults(np.zeros(0, np.float32), np.zeros(0, np.int32))]
     for some in blocks(len(level_ids), at_once(config.attempts, IN_CACHE)):
         params = jax.tree.map(lambda *xs: np.stack(xs), *(policies[i] for i in some))
-        parts.append(jax.device_get(_attempt(take(levels, some), level_ids[some], params, config, rules)))
+        parts.append(jax.device_get(attempt_block(take(levels, some), level_ids[some], params, config, rules)))
     return AttemptResults(*(np.concatenate(column)[: len(level_ids)] for column in zip(*parts, strict=True)))
 
 
 @partial(jax.jit, static_argnames=("config", "rules"))
-def _attempt(
+def attempt_block(
     levels: Level, level_ids: Int[Array, " level"], params: Params, config: ExpertConfig, rules: TaskParams
 ) -> AttemptResults:
     network, shape = network_of(levels.size, config), (len(level_ids), config.attempts)
-    no = jnp.zeros(shape, bool)
-    never, nothing = jnp.zeros(no.size), jnp.zeros((1, len(CHOICES), len(level_ids)), jnp.int8)
-    manner = ActionRule(no.reshape(-1), never, no.reshape(-1), nothing)
+    no, manner = jnp.zeros(shape, bool), ActionRule.sampling(math.prod(shape), len(level_ids))
     keys = jax.vmap(lambda level_id: key_for(level_id, Stream.SUCCESS_RATE))(level_ids)
 
     def act(now: _Attempting) -> _Attempting:
         key = jax.vmap(jax.random.fold_in, (0, None))(keys, now.part)
-        acting, seen, _ = rollout(network, params, levels, now.acting, key, manner, PART, rules)
-        ends, first = seen.done.any(0), jnp.argmax(seen.done, 0)
-        goal = jnp.take_along_axis(seen.goal, first[None], 0)[0]
+        acting, trajectory, _ = rollout(network, params, levels, now.acting, key, manner, PART, rules)
+        ends, first = trajectory.done.any(0), jnp.argmax(trajectory.done, 0)
+        goal = jnp.take_along_axis(trajectory.goal, first[None], 0)[0]
         steps = jnp.where(now.ended, 0, jnp.where(ends, first + 1, PART)).sum(1)
         reached = now.reached | (~now.ended & ends & goal)
         return _Attempting(acting, now.part + 1, now.ended | ends, reached, now.env_steps + steps)
 
     going = lambda now: (now.part < RECORD_STEPS // PART) & ~now.ended.all()
-    begun = _Attempting(start(repeat(levels, config.attempts)), jnp.int32(0), no, no, jnp.zeros(shape[0], jnp.int32))
-    after = jax.lax.while_loop(going, act, begun)
+    first = _Attempting(start(repeat(levels, config.attempts)), jnp.int32(0), no, no, jnp.zeros(shape[0], jnp.int32))
+    after = jax.lax.while_loop(going, act, first)
     return AttemptResults(after.reached.mean(1), after.env_steps)  # pyright: ignore[reportArgumentType]

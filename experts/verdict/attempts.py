@@ -1,4 +1,4 @@
-"""Attempts of an expert in training, to watch. They leave no trace in its training."""
+"""Attempts of an expert that is still training, for people to watch. They leave no trace in its training."""
 
 from functools import partial
 from typing import NamedTuple
@@ -13,7 +13,6 @@ from levelproof.experts.policy import network_of
 from levelproof.experts.training.rollout import ActionRule, rollout, start
 from levelproof.levelgen.batching import repeat
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.task.actions import CHOICES
 from levelproof.levelgen.task.rules import TaskParams
 
 
@@ -41,21 +40,20 @@ def attempts(
         steps: env steps of each attempt.
     """
     network, lanes = network_of(level.size, config), repeat(level, count)
-    no, never = jnp.zeros(count, bool), jnp.zeros(count)
-    manner = ActionRule(no, never, no, jnp.zeros((1, len(CHOICES), 1), jnp.int8))
+    manner, no = ActionRule.sampling(count, 1), jnp.zeros(count, bool)
     params = jax.tree.map(lambda x: x[None], params)
 
     def act(carry, key):
         acting, ended, shown, reached = carry
-        acting, seen, _ = rollout(network, params, level, acting, key[None], manner, 1, rules)
+        acting, trajectory, _ = rollout(network, params, level, acting, key[None], manner, 1, rules)
         state = acting.world.state
         shown = jax.tree.map(lambda old, new: jnp.where(ended, old, new), shown, (state.position, state.rotation))
-        reached |= ~ended & seen.goal[0, 0]
-        return (acting, ended | seen.done[0, 0], shown, reached), shown
+        reached |= ~ended & trajectory.goal[0, 0]
+        return (acting, ended | trajectory.done[0, 0], shown, reached), shown
 
-    begun = start(lanes)
-    state = begun.world.state
+    first = start(lanes)
+    state = first.world.state
     carry, (position, rotation) = jax.lax.scan(
-        act, (begun, no, (state.position, state.rotation), no), jax.random.split(key, steps)
+        act, (first, no, (state.position, state.rotation), no), jax.random.split(key, steps)
     )
     return Attempts(position, rotation, carry[-1])

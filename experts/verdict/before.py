@@ -27,10 +27,10 @@ def decide(levels: Level, rules: TaskParams) -> PriorVerdicts:
     count = levels.role.shape[-1]
     facts = facts_of(levels, rules)
     verdicts: list[Verdict | None] = [None] * count
-    falls = np.flatnonzero(facts.reaches)
-    if len(falls):
-        idle = replay(take(levels, falls), np.zeros((RECORD_STEPS, ACTIONS, len(falls)), np.int32), rules)
-        for i, solved, steps in zip(falls, succeeds(idle.done, idle.goal), steps_to_goal(idle.done), strict=True):
+    reaching = np.flatnonzero(facts.reaches)
+    if len(reaching):
+        idle = replay(take(levels, reaching), np.zeros((RECORD_STEPS, ACTIONS, len(reaching)), np.int32), rules)
+        for i, solved, steps in zip(reaching, succeeds(idle.done, idle.goal), steps_to_goal(idle.done), strict=True):
             if solved:
                 verdicts[i] = untrained(Label.TRIVIAL, trivial_reason(int(steps)), False, Source.NOTHING, int(steps))
     for i in np.flatnonzero(facts.proof != Proof.NONE):

@@ -29,7 +29,7 @@ def label_given(
     record = replay(levels, action, rules)
     whole, done, steps = succeeds(record.done, record.goal), np.asarray(record.done), steps_to_goal(record.done)
     at_first = np.take_along_axis(np.asarray(record.goal), steps[None] - 1, 0)[0]
-    fails = done[steps - 1, np.arange(len(steps))]  # False: no episode ended
+    ends = done[steps - 1, np.arange(len(steps))]  # whether any episode ends
     new = action.copy()
     for i, verdict in enumerate(before):
         if verdict is not None:
@@ -48,7 +48,7 @@ def label_given(
             reason = WHOLE.format(episodes[i]) if whole[i] else AGAIN
             verdict = untrained(Label.SOLVED, reason, bool(failed[i]), Source.IMPORT, int(steps[i]))
         elif verdict is None:
-            reason = MISSED.format("the first episode ends otherwise" if fails[i] else "no episode ends")
+            reason = MISSED.format("the first episode ends otherwise" if ends[i] else "no episode ends")
             verdict = untrained(Label.UNSOLVED, reason, bool(failed[i]))
         verdicts.append(verdict)
     return record, verdicts

@@ -72,7 +72,7 @@ def judge(
     config: ExpertConfig,
     failed_by_noop: Bool[np.ndarray, " level"],
 ) -> list[Verdict]:
-    """Return verdicts. A witness counts only if its replay, `record`, reaches the goal in as many env steps.
+    """Return verdicts. A witness counts only if its replay, `record`, reaches the goal in the same number of env steps.
 
     `chosen` are the witnesses before replay.
     """
@@ -91,10 +91,10 @@ def candidates_of(evaluations: Sequence[Evaluation], source: Source, config: Exp
 
     If there are none, the candidate is the rehearsed success, which comes from `source`.
     """
-    found = [witness for e in evaluations for witness in witnesses_in(e, config)]
-    if not found and config.exploration:
+    witnesses = [witness for e in evaluations for witness in witnesses_in(e, config)]
+    if not witnesses and config.exploration:
         return repeating(evaluations[-1].success, source)
-    return shortest_first(found)
+    return shortest_first(witnesses)
 
 
 def shortest_first(witnesses: Iterable[Witness]) -> list[Witness]:
@@ -122,7 +122,7 @@ def witnesses_in(evaluation: Evaluation, config: ExpertConfig) -> list[Witness]:
     played = lambda steps, attempt, start: evaluation.action[start : start + steps, :, attempt]
     distinct = {
         played(*episode).tobytes(): episode for episode in sorted(episodes, reverse=True)
-    }  # keep the first of copies
+    }  # reversed, so that the first of equal episodes is kept
     shortest = sorted(distinct.values())[: MAX_CANDIDATES if config.replays else 1]
     return [Witness(repeated(played(*episode), episode[0]), source(episode[1]), episode[0]) for episode in shortest]
 

@@ -6,7 +6,6 @@ chaotic world the same actions then miss the goal. A level's witness is its most
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +18,7 @@ from levelproof.experts.verdict.judge import Witness
 from levelproof.levelgen.batching import at_once, block_size, blocks, take
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import Level
+from levelproof.levelgen.quick import jit_quickly
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.types import State
 
@@ -34,7 +34,7 @@ def choose(
     replays: int,
     rules: TaskParams,
 ) -> list[Witness | None]:
-    """Choose each level's most portable candidate, the first of several; return it with its portability.
+    """Choose each level's most portable candidate, the first if several tie; return it with its portability.
 
     Candidates after one that survives all replays are not replayed, nor are candidates of known portability.
 
@@ -52,8 +52,8 @@ def choose(
     while left:
         now = {i: candidates[i][rank] for i in left}
         new = [i for i, witness in now.items() if witness.portability is None]
-        found = survival(take(levels, np.array(new, int)), level_ids[new], [now[i] for i in new], replays, rules)
-        now |= {i: now[i]._replace(portability=share) for i, share in zip(new, found.tolist(), strict=True)}
+        survived = survival(take(levels, np.array(new, int)), level_ids[new], [now[i] for i in new], replays, rules)
+        now |= {i: now[i]._replace(portability=share) for i, share in zip(new, survived.tolist(), strict=True)}
         for i, witness in now.items():
             if witness.portability is not None and witness.portability > shares[i]:
                 best[i], shares[i] = witness, witness.portability
@@ -78,12 +78,13 @@ def survival(
     for some in blocks(len(witnesses), size):
         action = np.stack([witnesses[i].action for i in some], -1).astype(np.int8)
         steps = np.array([witnesses[i].steps for i in some], np.int32)
-        shares.append(jax.device_get(_survival(take(levels, some), level_ids[some], action, steps, replays, rules)))
+        given = take(levels, some), level_ids[some], action, steps
+        shares.append(jax.device_get(survival_block(*given, replays, rules)))
     return np.concatenate([np.zeros(0, np.float32), *shares])[: len(witnesses)]
 
 
-@partial(jax.jit, static_argnames=("replays", "rules"))
-def _survival(
+@jit_quickly(static_argnames=("replays", "rules"))
+def survival_block(
     levels: Level,
     level_ids: Int[Array, " level"],
     action: Int[Array, "256 6 level"],

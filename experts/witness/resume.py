@@ -76,7 +76,7 @@ def resume(
 def _resume_block(
     level: Level, moves: Moves, states: KnownStates | None, timestep, rules: TaskParams, fields: frozenset[str]
 ) -> Resumed:
-    seen = any(name.startswith("manifold/") for name in fields)
+    with_contacts = any(name.startswith("manifold/") for name in fields)
 
     def act(carry, given):
         now, manifold = carry
@@ -85,7 +85,7 @@ def _resume_block(
             distance = now.last_distance if states.last_distance is None else states.last_distance
             known = TaskState(states.state, timestep, distance)
             now = jax.tree.map(lambda x, y: jnp.where(states.known, x, y), known, now)
-        after, outcome, _, contacts = task.advance_driven(level, now, controls(level, action), rules, seen)
+        after, outcome, _, contacts = task.advance_driven(level, now, controls(level, action), rules, with_contacts)
         agrees = (outcome.done == done) & (outcome.goal == goal)
         made = record_of(level, now, manifold, action, StepResult(outcome.reward, done, goal))
         wanted = {name: x for name, x in paths_of(made).items() if name in fields}
@@ -93,7 +93,7 @@ def _resume_block(
         return onwards(level, after, contacts, done), Resumed(wanted, sums, agrees)
 
     start = task.reset(level)
-    contacts = zeros_of(Manifold, level.size, len(start.timestep)) if seen else None
+    contacts = zeros_of(Manifold, level.size, len(start.timestep)) if with_contacts else None
     return jax.lax.scan(act, (start, contacts), (moves, states, timestep, jnp.arange(RECORD_STEPS)))[1]
 
 

@@ -19,10 +19,10 @@ from levelproof.levelgen.batching import blocks, take
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import controls
+from levelproof.levelgen.task.measures import world_points
 from levelproof.levelgen.task.rules import DEFAULT_RULES, StepResult, TaskParams, TaskState
 from levelproof.physics.buffers import zeros_of
 from levelproof.physics.types import Manifold, State
-from levelproof.physics.vector import select, unvec, vec
 
 
 @jax.tree_util.register_dataclass
@@ -55,7 +55,7 @@ def replay(level: Level, action: ArrayLike, rules: TaskParams = DEFAULT_RULES) -
     level = jax.tree.map(np.asarray, level)
     actions = np.asarray(action, np.int32)
     count = actions.shape[-1]
-    parts = [jax.device_get(_replay_block(take(level, lanes), actions[..., lanes], rules)) for lanes in blocks(count)]
+    parts = [jax.device_get(replay_block(take(level, lanes), actions[..., lanes], rules)) for lanes in blocks(count)]
     return jax.tree.map(lambda *xs: np.ascontiguousarray(np.concatenate(xs, -1)[..., :count]), *parts)
 
 
@@ -71,10 +71,12 @@ def steps_to_goal(done: ArrayLike) -> Int[np.ndarray, " level"]:
 
 
 @partial(jax.jit, static_argnames="rules")
-def _replay_block(level: Level, action: Int[Array, "256 6 lane"], rules: TaskParams) -> Record:
+def replay_block(level: Level, action: Int[Array, "256 6 lane"], rules: TaskParams) -> Record:
     def act(carry: tuple[TaskState, Manifold], action):
         now, manifold = carry
-        after, outcome, _, contacts = task.advance_driven(level, now, controls(level, action), rules, seen=True)
+        after, outcome, _, contacts = task.advance_driven(
+            level, now, controls(level, action), rules, with_contacts=True
+        )
         return onwards(level, after, contacts, outcome.done), record_of(level, now, manifold, action, outcome)
 
     start = task.reset(level)
@@ -92,20 +94,10 @@ def record_of(level: Level, now: TaskState, manifold: Any, action: Int[Array, "6
     return Record(
         now.state,
         manifold,
-        _points(now.state, model.joint_a, model.joint_anchor_a),
-        _points(now.state, model.thruster_body, model.thruster_position),
+        world_points(now.state, model.joint_a, model.joint_anchor_a),
+        world_points(now.state, model.thruster_body, model.thruster_position),
         now.timestep,
         now.last_distance,
         action,
         *outcome,
     )
-
-
-def _points(state: State, body: Int[Array, "thing lane"], point: Float[Array, "thing 2 lane"]) -> Array:
-    """Transform points from the frames of bodies to the world."""
-    if not len(body):
-        return jnp.zeros_like(point)
-    pick = lambda x: jnp.stack([select(x, b) for b in body])
-    rotation = pick(state.rotation)
-    centre = vec(state.position).map(pick)
-    return unvec(vec(point).rotate(jnp.cos(rotation), jnp.sin(rotation)) + centre)

@@ -134,7 +134,7 @@ def to_kinetix(size: Size, arrays: Any, names: Mapping[str, str]) -> Fields:
 def fillers(level: Level) -> Fields:
     """Return the values that the reference's sampler leaves in fields that nothing reads, level axis first.
 
-    For a circle, it also draws the vertices of a rectangle: those of CIRCLE_VERTICES in seven of ten circles.
+    It also draws the vertices of a rectangle for each circle: in seven of ten they are CIRCLE_VERTICES, as in all here.
     """
     scenery = np.arange(level.size.polygons)[:, None] < FIXED_POLYGONS
     polygons, circles = np.split(np.asarray(level.model.active), [level.size.polygons])

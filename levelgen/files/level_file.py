@@ -71,8 +71,8 @@ def write_level_file(file: LevelFile, path: Path) -> None:
     """Write a level as JSON that Kinetix and its editor open; the file appears whole or not at all.
 
     Raises:
-        LevelFileError: a file cannot hold the level: it is not one lane, starts with contacts, or has motors that run
-            by themselves.
+        LevelFileError: a file cannot hold the level: it does not have exactly one lane, starts with contacts, or has
+            motors that run by themselves.
         OSError: the file cannot be written.
     """
     text = json.dumps(to_document(file)) + "\n"
@@ -116,7 +116,7 @@ def from_document(document: object) -> LevelFile:
             )
     size = Size(*(entry.read(static, name, "static_env_params") for name, entry in layout.COUNTS.items()))
     if size.bodies == FIXED_POLYGONS:
-        raise LevelFileError("static_env_params has no room for a body beside the scenery")
+        raise LevelFileError("static_env_params has no room for a body besides the scenery")
     level = level_from_kinetix(_fields(world, size))
     _check(level)
     collides: Any = np.asarray(collision_matrix(level.model))
@@ -177,7 +177,7 @@ def _fields(world: object, size: Size) -> Fields:
 
 
 def flaws(level: Level) -> Iterator[tuple[Any, str, str]]:
-    """Yield what the engine cannot simulate and no single entry shows: (flags [row, lane], kind, reason)."""
+    """Yield (flags [row, lane], kind, reason) of flaws: what the engine cannot simulate, but no single entry shows."""
     model, state, scenery = level.model, level.state, slice(FIXED_POLYGONS)
     moves = (model.inverse_mass != 0) | (model.inverse_inertia != 0) | (state.angular_velocity != 0)
     moves |= np.any(np.asarray(state.velocity), 1)

@@ -1,9 +1,9 @@
 """A level's content and its hash, which do not depend on how bodies, joints and thrusters are numbered.
 
 docs/levels.md says what counts as content. Levels with the same hash have the same content, except for collisions of
-128 bits. Levels with the same content have the same hash, unless they contain exact copies of a body (at one position,
-with one motion) that are also joined alike: then the hash may depend on how the copies are numbered. No sampled or
-handmade level contains such copies. Numpy on the host.
+the 128-bit hash. Levels with the same content have the same hash, unless they contain exact copies of a body (at one
+position, with one motion) that are also joined alike: then the hash may depend on how the copies are numbered. No
+sampled or handmade level contains such copies. Numpy on the host.
 """
 
 import hashlib
@@ -91,7 +91,7 @@ def body_kinds(levels: Any) -> np.ndarray:
 
 
 def _body_rows(levels: Any) -> np.ndarray:
-    """Return all of a body except its shape. The index among the four scenery polygons is not content."""
+    """Return all content of a body except its shape. The index among the four scenery polygons is not content."""
     model, state = levels.model, levels.state
     matter = model.inverse_mass, model.inverse_inertia, model.friction, model.restitution
     motion = state.position, state.rotation, state.velocity, state.angular_velocity

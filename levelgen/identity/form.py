@@ -22,7 +22,7 @@ class Side(NamedTuple):
     first: int
     second: int
     row: bytes  # values, reversed if seen from b
-    direction: int  # in which the entry's forward turns it: 1, -1, or 0 if that makes no difference
+    direction: int  # which way the entry's forward turns it: 1 or -1; 0 if this makes no difference
     entry: int  # of the action that the motor obeys, or NO_ENTRY
 
 
@@ -73,7 +73,7 @@ def canonical_form(world: World) -> bytes:
 
 
 def _body_ranks(world: World) -> list[int]:
-    """Rank the bodies, each with a different rank."""
+    """Rank the bodies; no two share a rank."""
     own = _ranks(world.bodies)
     around: list[list[tuple[int, bytes]]] = [[] for _ in own]
     for sides in world.joints:

@@ -16,10 +16,15 @@ from jax.extend.random import define_prng_impl, threefry_prng_impl
 from jaxtyping import Array, Int, Key
 from numpy.typing import ArrayLike
 
-SAMPLER_VERSION = 1  # increment when a change gives an id another level or other random streams
-SEEDS = 0x5EED  # what keys of seeds fold in the place of the sampler's version
-ROOT_KEY = (0, 0)  # as words, not as a seed, to which JAX would add `jax_random_seed_offset`
+SAMPLER_VERSION = 2  # of the sampler's arithmetic: increment if a change alters any bit of the level of any id
+# Versions whose levels differ only in the last digits of numbers; version 1 was computed by XLA, whose bits depended
+# on the processor
+ALIKE_VERSIONS = (1, 2)
+STREAMS = 1  # folded into the root key for all keys of levels
+SEEDS = 0x5EED  # folded into the root key for all keys of seeds
+ROOT_KEY = (0, 0)  # the key's words; to a seed, JAX would add `jax_random_seed_offset`
 MAX_LEVEL_ID = 2**31 - 1  # fits into 32 bits, signed or unsigned
+FRESH_BITS = 30  # of an id drawn at random, which keeps it below the ids of levels that policies are measured on
 
 
 def _pinned(draw: Callable[..., Any]) -> Callable[..., Any]:
@@ -77,7 +82,7 @@ def key_for(level_id: Int[Array, ""] | int, stream: Stream) -> Key[Array, ""]:
 
     `level_id` is 0 .. MAX_LEVEL_ID; it may be traced, and mapped with `jax.vmap`.
     """
-    level_key = jax.random.fold_in(jax.random.fold_in(_root(), SAMPLER_VERSION), level_id)
+    level_key = jax.random.fold_in(jax.random.fold_in(_root(), STREAMS), level_id)
     return jax.random.fold_in(level_key, int(stream))
 
 

@@ -5,7 +5,7 @@ a revolute joint, a crossed square a fixed one. A motor's ring has the colour of
 runs; a thruster is a nozzle, with a flame while it fires. The row below shows the live entries of the action, M1 to M4
 for motors and T1, T2 for thrusters.
 
-All scenes of a level have the same parts in the same order, so a film animates parts. Lengths are metres, y points
+All scenes of a level have the same parts in the same order, so a film animates each part. Lengths are metres, y points
 up, angles are radians.
 """
 

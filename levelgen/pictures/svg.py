@@ -15,13 +15,13 @@ from levelproof.levelgen.pictures.shapes import Part, Scene, digits, rectangle
 from levelproof.levelgen.pictures.style import BORDER, FONTS, HATCH, HEADER, PAPER, PIXELS
 
 WIDTH = WORLD_SIDE + 2 * BORDER  # m, of a picture
-TOP = WORLD_SIDE + BORDER + HEADER  # m, of a picture's upper edge above the world's lower one
+TOP = WORLD_SIDE + BORDER + HEADER  # m, height of a picture's upper edge above the world's lower edge
 
 
 def svg_of(scenes: Sequence[Scene], seconds: Sequence[float], pixels: int = PIXELS) -> str:
-    """Write an SVG file, `pixels` wide: a looping film that shows each scene for its seconds; one scene: a picture.
+    """Return an SVG document, `pixels` wide: a looping film that shows each scene for its seconds.
 
-    All scenes must be of one level.
+    A single scene gives a picture. All scenes must be of one level.
     """
     first, (*ends, length) = scenes[0], accumulate(seconds)
     clock = tuple(end / length for end in (0.0, *ends)), length
@@ -46,7 +46,7 @@ Clock = tuple[tuple[float, ...], float]  # start of each scene as a fraction of 
 
 
 def _animate(clock: Clock, tag: str, values: Sequence[str], smooth: bool) -> str:
-    """Animate the parent element by one value per scene; of a run of equal values, keep only the ends."""
+    """Animate the parent element by one value per scene, without the redundant values in a run of equal ones."""
     (starts, length), last = clock, len(values) - 1
     keep = [
         i

@@ -19,7 +19,7 @@ class Caption:
     title: str = ""  # left; shortened to fit
     clock: str = ""  # right
     outcome: str = ""  # a badge in the middle
-    good: bool = True  # colour of the badge
+    good: bool = True  # whether the badge has the colour of success
 
 
 def caption_parts(caption: Caption) -> list[Part]:

@@ -1,1 +1,1 @@
-"""Random levels: bodies proposed one by one from a distribution; of each, the proposal that overlaps least is kept."""
+"""Random levels: bodies are added one by one, each the least overlapping of several random proposals."""

@@ -5,15 +5,15 @@ mutate_add_connected_shape, `add_thruster` is mutate_add_thruster. Their numbers
 """
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Int
 
-from levelproof.levelgen.level import HALF_WORLD, MOTOR_BINDINGS, THRUSTER_BINDINGS, WORLD_SIDE, Level, Role
+from levelproof.levelgen.level import HALF_WORLD, MOTOR_BINDINGS, THRUSTER_BINDINGS, WORLD_SIDE, Role
 from levelproof.levelgen.sampling.distribution import Distribution
-from levelproof.levelgen.sampling.draws import at, between, choose, first_free, first_of_two, put
+from levelproof.levelgen.sampling.draft import Draft, read_body
+from levelproof.levelgen.sampling.draws import between, cumulate, first_of_two, pick_row
 from levelproof.levelgen.sampling.proposal import (
     BodyDraws,
     BodyShape,
@@ -24,12 +24,13 @@ from levelproof.levelgen.sampling.proposal import (
     draw_role,
     draw_shape,
     shape_mass,
-    turned,
 )
 from levelproof.levelgen.sampling.scenery import FLOOR_TOP
+from levelproof.physics.lanes import NOBODY, Scalar, gather, put
 from levelproof.physics.mass import inverse
+from levelproof.physics.trigonometry import angle_of, cos_sin
 from levelproof.physics.types import FIXED_POLYGONS
-from levelproof.physics.vector import Vec, unvec, vec, where
+from levelproof.physics.vector import Vec, unvec, where
 
 TURN = 2 * math.pi  # rad, a full turn
 
@@ -48,11 +49,11 @@ class ThrusterDraws(NamedTuple):
     binding: Lane
 
 
-def propose_free(level: Level, d: BodyDraws, may_be_fixed: Flag, joint: Joint, dist: Distribution) -> Proposal:
+def propose_free(draft: Draft, d: BodyDraws, may_be_fixed: Flag, joint: Joint, dist: Distribution) -> Proposal:
     """Propose a body above the floor, without a joint. `joint` fills the unused field of the result."""
-    room_polygon, room_circle = has_room(level)
+    room_polygon, room_circle = has_room(draft)
     is_polygon = first_of_two(room_polygon, room_circle, d.is_polygon)
-    role = draw_role(level, d.role, True, dist)
+    role = draw_role(draft, d.role, True, dist)
     goal = role != Role.PLAIN
     shape = draw_shape(
         d, is_polygon, dist.max_size * jnp.where(goal & (role != Role.RED), dist.goal_size_factor, 1.0), dist
@@ -78,7 +79,7 @@ def propose_free(level: Level, d: BodyDraws, may_be_fixed: Flag, joint: Joint, d
 
 
 def free_position(d: BodyDraws, shape: BodyShape, role: Int[Array, " lane"], dist: Distribution) -> Vec:
-    """Draw a position whose body lies within the world; if on opposite sides, green goes left and blue right."""
+    """Draw a position that keeps the body within the world; if on opposite sides, green goes left and blue right."""
     reach = jnp.maximum(jnp.maximum(shape.half.x, shape.half.y) * math.sqrt(2), shape.radius)
     opposite = d.opposite < dist.opposite_sides_chance
     low = reach + jnp.where(opposite & (role == Role.BLUE), HALF_WORLD, 0.0)
@@ -86,33 +87,36 @@ def free_position(d: BodyDraws, shape: BodyShape, role: Int[Array, " lane"], dis
     return Vec(between(d.x, low, high), between(d.y, reach + FLOOR_TOP, WORLD_SIDE - reach))
 
 
-def propose_connected(level: Level, d: BodyDraws, revolute: Flag, dist: Distribution) -> Proposal:
-    """Propose a body joined to an existing one, even if that puts it outside the world."""
-    model, polygons = level.model, level.size.polygons
-    room_polygon, room_circle = has_room(level)
-    weight = target_weights(level, dist)
-    any_polygon = model.active[FIXED_POLYGONS:polygons].any(0)
-    any_circle = (weight[polygons:] > 0).any(0)
+def propose_connected(draft: Draft, d: BodyDraws, revolute: Flag, dist: Distribution) -> Proposal:
+    """Propose a body joined to an existing one, even if that puts it outside the world.
+
+    `weigh_targets` must have run since the last body was added.
+    """
+    used = draft.used
+    room_polygon, room_circle = has_room(draft)
+    any_polygon = used.polygons[...] > FIXED_POLYGONS
+    any_circle = draft.notes.upper[draft.size.bodies - 1] > 0 if draft.size.circles else jnp.zeros_like(any_polygon)
     target_is_polygon = first_of_two(any_polygon, any_circle, d.target_is_polygon) | ~room_polygon
     is_polygon = first_of_two(room_polygon, room_circle, d.is_polygon, dist.connected_circle_chance)
     is_polygon |= ~target_is_polygon & room_polygon  # a circle is not joined to a circle
     shape = draw_shape(d, is_polygon, dist.max_size, dist)
-    target = choose_target(level, weight, target_is_polygon, d.target)
+    chosen = choose_target(draft, target_is_polygon, d.target)
+    target = gather(draft.size.bodies, lambda i: read_body(draft, i), chosen)
 
     half = shape.half.scale(1.0 * is_polygon)  # circles are joined at their centres
     anchor = point_between(d.anchor_x, d.anchor_y, -half, half)
-    low, high = extent(level, target)
-    target_anchor = point_between(d.target_anchor_x, d.target_anchor_y, low, high)
+    target_anchor = point_between(d.target_anchor_x, d.target_anchor_y, target.low, target.high)
     rotation = d.rotation * TURN
-    meet = vec(at(level.state.position, target)) + turned(target_anchor, at(level.state.rotation, target))
-    role = draw_role(level, d.role, at(level.role, target) == Role.PLAIN, dist)
-    joint = draw_joint(level, d, (target, anchor, target_anchor), is_polygon & target_is_polygon, revolute, dist)
-    partner = BodyShape(target_is_polygon, (high - low).scale(0.5), at(radii(level), target))
-    possible = (room_polygon | room_circle) & model.active[FIXED_POLYGONS:].any(0) & ~model.joint_active.all(0)
+    meet = target.position + target_anchor.rotate(target.cos, target.sin)
+    role = draw_role(draft, d.role, target.role == Role.PLAIN, dist)
+    joint = draw_joint(draft, d, (chosen, anchor, target_anchor), is_polygon & target_is_polygon, revolute, dist)
+    partner = BodyShape(target_is_polygon, (target.high - target.low).scale(0.5), target.reach)
+    anyone = any_polygon | (used.circles[...] > 0)
+    possible = (room_polygon | room_circle) & anyone & (used.joints[...] < draft.size.joints)
     return Proposal(
         possible=possible,
         shape=shape,
-        position=meet - turned(anchor, rotation),
+        position=meet - anchor.rotate(*cos_sin(rotation)),
         rotation=rotation,
         role=role,
         fixed=jnp.zeros_like(possible),
@@ -122,55 +126,60 @@ def propose_connected(level: Level, d: BodyDraws, revolute: Flag, dist: Distribu
     )
 
 
-def target_weights(level: Level, dist: Distribution) -> Float[Array, "body lane"]:
-    """Return each body's weight as a joint's target: it falls with every joint, and is small for fixed bodies."""
-    model, bodies = level.model, level.size.bodies
-    body = jnp.arange(bodies)[:, None]
-    ends = ((model.joint_a[:, None] == body) * 1.0 + (model.joint_b[:, None] == body)) * model.joint_active[:, None]
-    joints = ends.sum(0)
-    free = jnp.where(
-        body < level.size.polygons,
-        jnp.maximum(1 - joints / dist.polygon_connections, 0.0),
-        joints == 0,
+def weigh_targets(draft: Draft, dist: Distribution) -> None:
+    """Write the cumulative weights of bodies as a joint's target, separately for polygons and circles.
+
+    A body's weight falls with each of its joints, and is small if the body is fixed. A circle has at most one joint. If
+    all polygons have their joints, any polygon may be chosen, scenery included.
+    """
+    rows, used, notes = draft.rows, draft.used, draft.notes
+    polygons, bodies = draft.size.polygons, draft.size.bodies
+    movable = lambda i: jnp.where(rows.inverse_mass[i] == 0, dist.fixed_target_weight, 1.0)
+
+    def polygon(i):
+        free = jnp.maximum(1 - notes.joints[i] / dist.polygon_connections, 0.0)
+        return jnp.where((i >= FIXED_POLYGONS) & (i < used.polygons[...]), free * movable(i), 0.0)
+
+    def circle(i):
+        return jnp.where((notes.joints[i] == 0) & (i - polygons < used.circles[...]), movable(i), 0.0)
+
+    cumulate(notes.upper, 0, polygons, polygon)
+    none_left = notes.upper[polygons - 1] == 0
+    anything = lambda i: jnp.where(none_left, 1.0 * (i < used.polygons[...]), polygon(i))
+    cumulate(notes.upper, 0, polygons, anything)
+    cumulate(notes.upper, polygons, bodies, circle)
+
+
+def choose_target(draft: Draft, is_polygon: Flag, u: Lane) -> Int[Array, " lane"]:
+    """Choose a polygon or a circle by the weights of `weigh_targets`; return its row."""
+    polygons, bodies = draft.size.polygons, draft.size.bodies
+    polygon = pick_row(draft.notes.upper, 0, polygons, u)
+    return (
+        jnp.where(is_polygon, polygon, pick_row(draft.notes.upper, polygons, bodies, u))
+        if bodies > polygons
+        else polygon
     )
-    movable = jnp.where(model.inverse_mass == 0, dist.fixed_target_weight, 1.0)
-    return jnp.where(model.active & (body >= FIXED_POLYGONS), free * movable, 0.0)
-
-
-def choose_target(
-    level: Level, weight: Float[Array, "body lane"], is_polygon: Flag, u: Lane
-) -> Bool[Array, "body lane"]:
-    """Choose a polygon (if all have their joints: any, scenery included) or a circle without a joint."""
-    polygons = level.size.polygons
-    any_left = (weight[:polygons] > 0).any(0)
-    among_polygons = jnp.where(any_left, weight[:polygons], level.model.active[:polygons])
-    circles = weight[polygons:]
-    parts = [choose(among_polygons, u) & is_polygon]
-    if level.size.circles:
-        parts.append(choose(circles, u) & ~is_polygon)
-    return jnp.concatenate(parts)
 
 
 def point_between(x: Lane, y: Lane, low: Vec, high: Vec) -> Vec:
-    """Return a point between two corners."""
+    """Return the point at fractions x and y of the way between two corners."""
     return Vec(between(x, low.x, high.x), between(y, low.y, high.y))
 
 
 def draw_joint(
-    level: Level, d: BodyDraws, ends: tuple[Array, Vec, Vec], polygons: Flag, revolute: Flag, dist: Distribution
+    draft: Draft, d: BodyDraws, ends: tuple[Array, Vec, Vec], polygons: Flag, revolute: Flag, dist: Distribution
 ) -> Joint:
     """Draw a joint and its motor.
 
     Args:
-        level: the level so far.
+        draft: the level so far.
         d: random numbers.
         ends: target and anchors, the first three fields of Joint.
         polygons: whether the joint connects two polygons.
         revolute: whether the joint must be revolute.
         dist: the distribution.
     """
-    model = level.model
-    enough = (model.joint_active & ~model.joint_fixed).sum(0) >= dist.min_revolute_joints
+    enough = draft.used.revolute[...] >= dist.min_revolute_joints
     fixed = (d.joint_fixed < dist.fixed_joint_chance) & enough & ~revolute
     turns = ~fixed
     limited = turns & polygons & (d.limited < dist.limit_chance)
@@ -212,50 +221,33 @@ def _reaches_beyond(small: BodyShape, big: BodyShape, small_anchor: Vec, big_anc
     return (reach > cover + margin) & (small.is_polygon | big.is_polygon)
 
 
-def add_thruster(
-    level: Level, d: ThrusterDraws, wanted: Flag, candidates: Bool[Array, "body lane"], dist: Distribution
-) -> Level:
-    """Add a thruster to one of the movable candidates; if `aligned`, it pushes through the body's centre."""
-    model, polygons = level.model, level.size.polygons
-    candidates &= model.inverse_mass != 0
-    body = choose(1.0 * candidates, d.body) & candidates
-    low, high = extent(level, body)
-    in_polygon = point_between(d.x, d.y, low, high)
-    angle, radius = d.x * TURN, d.y * at(radii(level), body)
-    position = where(body[:polygons].any(0), in_polygon, Vec(radius * jnp.cos(angle), radius * jnp.sin(angle)))
+def add_thruster(draft: Draft, d: ThrusterDraws, wanted: Flag, latest: Scalar, dist: Distribution) -> None:
+    """Add a thruster to a movable body that existed after turn `latest`; an aligned one pushes through its centre."""
+    rows, used, notes, bodies = draft.rows, draft.used, draft.notes, draft.size.bodies
+    may_push = lambda i: rows.active[i] & (rows.inverse_mass[i] != 0) & (notes.turn[i] <= latest)
+    cumulate(notes.upper, 0, bodies, lambda i: 1.0 * may_push(i))
+    anyone = notes.upper[bodies - 1] > 0
+    chosen = jnp.where(anyone, pick_row(notes.upper, 0, bodies, d.body), NOBODY)
+    body = gather(bodies, lambda i: read_body(draft, i), chosen)
+    cos, sin = cos_sin(d.x * TURN)
+    radius = d.y * body.reach
+    in_polygon = point_between(d.x, d.y, body.low, body.high)
+    position = where(chosen < draft.size.polygons, in_polygon, Vec(radius * cos, radius * sin))
     outward = position.scale(jnp.where(d.outward > 0.5, 1.0, -1.0))
-    centred = (position.x == 0) & (position.y == 0)
-    aligned = jnp.where(centred, 0.0, jnp.arctan2(outward.y, outward.x))
     power = between(d.power, dist.min_thruster_power, dist.max_thruster_power) * dist.thruster_power_factor
-    row = first_free(model.thruster_active) & wanted & candidates.any(0)
-    model = replace(
-        model,
-        thruster_active=model.thruster_active | row,
-        thruster_body=put(model.thruster_body, row, at(jnp.arange(level.size.bodies)[:, None], body)),
-        thruster_position=put(model.thruster_position, row, unvec(position)),
-        thruster_rotation=put(
-            model.thruster_rotation, row, jnp.where(d.aligned < dist.aligned_chance, aligned, d.angle * TURN)
-        ),
-        thruster_power=put(model.thruster_power, row, power * inverse(at(model.inverse_mass, body))),
+    added = wanted & anyone
+    put(
+        jnp.where(added, used.thrusters[...], NOBODY),
+        (rows.thruster_active, True),
+        (rows.thruster_body, chosen),
+        (rows.thruster_position, unvec(position)),
+        (rows.thruster_rotation, jnp.where(d.aligned < dist.aligned_chance, angle_of(*outward), d.angle * TURN)),
+        (rows.thruster_power, power * inverse(body.inverse_mass)),
+        (rows.thruster_binding, (d.binding * THRUSTER_BINDINGS).astype(jnp.int32)),
     )
-    binding = (d.binding * THRUSTER_BINDINGS).astype(jnp.int32)
-    return replace(level, model=model, thruster_binding=put(level.thruster_binding, row, binding))
+    used.thrusters[...] += added
 
 
-def has_room(level: Level) -> tuple[Flag, Flag]:
+def has_room(draft: Draft) -> tuple[Flag, Flag]:
     """Whether one more polygon fits, and one more circle."""
-    polygons = level.size.polygons
-    return ~level.model.active[:polygons].all(0), ~level.model.active[polygons:].all(0)
-
-
-def extent(level: Level, chosen: Bool[Array, "body lane"]) -> tuple[Vec, Vec]:
-    """Return the lower left and upper right corner of the chosen polygon in its own frame; zero for circles."""
-    vertices = level.model.vertices
-    polygon = chosen[: level.size.polygons]
-    return vec(at(vertices.min(1), polygon)), vec(at(vertices.max(1), polygon))
-
-
-def radii(level: Level) -> Float[Array, "body lane"]:
-    """Return the radius of every body, zero for polygons, m."""
-    lanes = level.model.radius.shape[-1]
-    return jnp.concatenate([jnp.zeros((level.size.polygons, lanes)), level.model.radius])
+    return draft.used.polygons[...] < draft.size.polygons, draft.used.circles[...] < draft.size.circles

@@ -1,8 +1,8 @@
 """How much a new body overlaps the others: the number of contacts that the engine would find.
 
 The reference counts all contacts of every proposed level. Those among older bodies are the same in all proposals of a
-body, so only pairs with the new body are counted here, all at once. Contacts count as in physics/manifold.py, which a
-test compares: up to two per pair of polygons, one per pair with a circle; joined bodies count too. The geometry is not
+body, so only pairs with the new body are counted here. Contacts count as in physics/manifold.py, which a test
+compares: up to two per pair of polygons, one per pair with a circle; joined bodies count too. The geometry is not
 shared with manifold.py, whose kernel projects on faces instead of measuring from vertices: its last bits, and
 occasionally its count, differ, which would change the levels of existing ids.
 """
@@ -12,65 +12,45 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from levelproof.physics.manifold import FLIP_BIAS, Faces, faces
-from levelproof.physics.types import Model, State
-from levelproof.physics.vector import Vec, nonzero, vec
+from levelproof.physics.manifold import FLIP_BIAS, faces
+from levelproof.physics.vector import Vec, nonzero
 
 
-class WorldPolygons(NamedTuple):
-    """Polygons in the world frame, clockwise, all with four vertices."""
+class WorldPolygon(NamedTuple):
+    """A polygon in the world, clockwise, with four corners; components [corner, lane]."""
 
-    vertex: Vec  # components [vertex, polygon, lane]
-    face: Faces  # from a vertex to the next
+    corner: Vec
+    along: Vec  # unit vector from a corner to the next
+    outward: Vec  # unit normal of that face
+    length: Float[Array, "corner lane"]
 
-
-class WorldCircles(NamedTuple):
-    """Circles in the world frame."""
-
-    centre: Vec  # components [circle, lane]
-    radius: Float[Array, "circle lane"]
-
-
-def count_contacts(
-    model: Model,
-    state: State,
-    corners: Float[Array, "vertex 2 lane"],
-    body: WorldCircles,
-    is_polygon: Bool[Array, " lane"],
-) -> Int[Array, " lane"]:
-    """Count a new body's contacts with the active bodies; it is a polygon with `corners`, or the circle `body`."""
-    n = model.size.polygons
-    cos, sin, position = jnp.cos(state.rotation[:n]), jnp.sin(state.rotation[:n]), vec(state.position)
-    local = vec(model.vertices).map(lambda x: x.swapaxes(0, 1))
-    polygons = in_world(local.rotate(cos, sin) + position.map(lambda x: x[:n]))
-    new = in_world(vec(corners).map(lambda x: x[:, None]))
-    circles = WorldCircles(position.map(lambda x: x[n:]), model.radius)
-    between = (circles.centre - body.centre).norm()
-    touching = jnp.where(
-        is_polygon,
-        jnp.concatenate([polygon_contacts(polygons, new), touch(new, circles).astype(jnp.int32)]),
-        jnp.concatenate([touch(polygons, body), between < circles.radius + body.radius]).astype(jnp.int32),
-    )
-    return jnp.where(model.active, touching, 0).sum(0)
+    @staticmethod
+    def of(corner: Vec) -> "WorldPolygon":
+        """Return the outline with these corners."""
+        edge, length, outward = faces(corner)
+        return WorldPolygon(corner, edge.scale(1 / nonzero(length)), outward, length)
 
 
-def in_world(vertex: Vec) -> WorldPolygons:
-    return WorldPolygons(vertex, faces(vertex))
+class WorldCircle(NamedTuple):
+    """A circle in the world; [lane]."""
+
+    centre: Vec
+    radius: Float[Array, " lane"]
 
 
-def polygon_contacts(a: WorldPolygons, b: WorldPolygons) -> Int[Array, "polygon lane"]:
-    """Count each pair's contacts, 0 to 2: the two deepest vertices beyond the face that separates most."""
+def polygon_contacts(a: WorldPolygon, b: WorldPolygon) -> Int[Array, " lane"]:
+    """Count a pair's contacts, 0 to 2: corners that lie behind the face that separates most."""
     (first_a, second_a), (first_b, second_b) = deepest(a, b), deepest(b, a)
     second = jnp.where(first_a + FLIP_BIAS < first_b, second_b, second_a)
     touching = jnp.maximum(first_a, first_b) < 0
     return touching.astype(jnp.int32) + (touching & (second < 0))
 
 
-def deepest(a: WorldPolygons, b: WorldPolygons) -> tuple[Float[Array, "polygon lane"], Float[Array, "polygon lane"]]:
-    """Return the distances of b's two deepest vertices from the face of a that separates most (negative: inside)."""
+def deepest(a: WorldPolygon, b: WorldPolygon) -> tuple[Float[Array, " lane"], Float[Array, " lane"]]:
+    """Return the distances of b's two deepest corners from the face of a that separates most (negative: inside)."""
     reach = [
-        a.face.outward.dot(Vec(b.vertex.x[k] - a.vertex.x, b.vertex.y[k] - a.vertex.y)) for k in range(4)
-    ]  # distance of b's vertex k from each face of a
+        a.outward.dot(Vec(b.corner.x[k] - a.corner.x, b.corner.y[k] - a.corner.y)) for k in range(4)
+    ]  # distance of b's corner k from each face of a
     low, high = jnp.minimum(reach[0], reach[1]), jnp.maximum(reach[0], reach[1])
     low2, high2 = jnp.minimum(reach[2], reach[3]), jnp.maximum(reach[2], reach[3])
     first = jnp.minimum(low, low2)
@@ -82,11 +62,14 @@ def deepest(a: WorldPolygons, b: WorldPolygons) -> tuple[Float[Array, "polygon l
     return best, runner_up
 
 
-def touch(polygons: WorldPolygons, circles: WorldCircles) -> Bool[Array, "pair lane"]:
+def touch(polygon: WorldPolygon, circle: WorldCircle) -> Bool[Array, " lane"]:
     """Whether the circle's centre lies inside the polygon or within its radius of an edge."""
-    vertex, (edge, length, normal) = polygons
-    along = edge.scale(1 / nonzero(length))
-    offset = circles.centre - vertex
-    clipped = along.scale(jnp.clip(along.dot(offset), 0.0, length))
-    inside = (normal.dot(offset) < 0).all(0)
-    return inside | ((offset - clipped).norm().min(0) <= circles.radius)
+    offset = circle.centre - polygon.corner
+    clipped = polygon.along.scale(jnp.clip(polygon.along.dot(offset), 0.0, polygon.length))
+    inside = (polygon.outward.dot(offset) < 0).all(0)
+    return inside | ((offset - clipped).norm().min(0) <= circle.radius)
+
+
+def discs_touch(a: WorldCircle, b: WorldCircle) -> Bool[Array, " lane"]:
+    """Whether two circles overlap."""
+    return (a.centre - b.centre).norm() < a.radius + b.radius

@@ -1,23 +1,27 @@
 """A body that the sampler may add: its random numbers, its shape, its joint, and how it enters a level.
 
-Lanes are last; choices are one-hot instead of indices. Follows `kinetix.environment.ued` 3.0.2; numbers are fields of
-`Distribution`. A proposal is only the new body and joint, where the reference's mutators return a whole new level.
+Follows `kinetix.environment.ued` 3.0.2; numbers are fields of `Distribution`. A proposal is only the new body and its
+joint, whereas the reference's mutators return a whole new level.
 """
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from levelproof.levelgen.level import Level, Role
+from levelproof.levelgen.level import Role
 from levelproof.levelgen.sampling.distribution import Distribution
-from levelproof.levelgen.sampling.draws import at, between, first_free, pick, put
+from levelproof.levelgen.sampling.draft import Draft, outline_changes, read_body, read_outline
+from levelproof.levelgen.sampling.draws import between, pick
+from levelproof.levelgen.sampling.overlap import WorldCircle, WorldPolygon, discs_touch, polygon_contacts, touch
+from levelproof.physics.lanes import NOBODY, Scalar, gather, put, scatter_add
 from levelproof.physics.mass import circle_area, circle_inertia, inverse, polygon_area, polygon_inertia
-from levelproof.physics.types import MAX_VERTICES
-from levelproof.physics.vector import Vec, unvec, vec, where
+from levelproof.physics.trigonometry import cos_sin
+from levelproof.physics.types import FIXED_POLYGONS, MAX_VERTICES
+from levelproof.physics.vector import Vec, unvec, where
 
 CORNERS = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)], np.float32)  # of a rectangle, clockwise
 Lane = Float[Array, " lane"]
@@ -69,7 +73,7 @@ class BodyShape(NamedTuple):
 class Joint(NamedTuple):
     """A joint from the proposed body to its target. Fields named as in Model hold that field's value."""
 
-    target: Bool[Array, "body lane"]
+    target: Int[Array, " lane"]  # row of a body
     anchor: Vec  # in the frame of the proposed body
     target_anchor: Vec
     joint_fixed: Flag
@@ -110,82 +114,111 @@ def draw_shape(d: BodyDraws, is_polygon: Flag, size: Lane | float, dist: Distrib
     )
 
 
-def corners(half: Vec) -> Float[Array, "vertex 2 lane"]:
-    """Return a rectangle's corners in its own frame."""
-    return jnp.asarray(CORNERS)[:, :, None] * unvec(half)[None]
+def corners(half: Vec) -> Vec:
+    """Return a rectangle's corners in its own frame, components [corner, lane]."""
+    return Vec(*(jnp.stack([sign * x for sign in signs.tolist()]) for x, signs in zip(half, CORNERS.T, strict=True)))
 
 
-def corners_in_world(p: Proposal) -> Float[Array, "vertex 2 lane"]:
-    """Return the corners of the body as if it were a polygon."""
-    return unvec(turned(vec(corners(p.shape.half)), p.rotation) + p.position)
+def outline_of(p: Proposal) -> WorldPolygon:
+    """Return the outline of the body as if it were a polygon."""
+    return WorldPolygon.of(corners(p.shape.half).rotate(*cos_sin(p.rotation)) + p.position)
 
 
 def shape_mass(shape: BodyShape) -> tuple[Lane, Lane]:
     """Return mass, kg, and inertia, kg m^2; all bodies have a density of 1 kg/m^2."""
-    vertices, four = corners(shape.half)[None], jnp.full((1, *shape.radius.shape), MAX_VERTICES)
+    vertices = unvec(corners(shape.half))[None]
+    four = jnp.full((1, *shape.radius.shape), MAX_VERTICES)
     mass = jnp.where(shape.is_polygon, polygon_area(vertices, four)[0], circle_area(shape.radius))
     inertia = jnp.where(shape.is_polygon, polygon_inertia(vertices, four)[0], circle_inertia(shape.radius))
     return mass, inertia
 
 
-def draw_role(level: Level, u: Lane, red_allowed: Flag | bool, dist: Distribution) -> Int[Array, " lane"]:
+def draw_role(draft: Draft, u: Lane, red_allowed: Flag | bool, dist: Distribution) -> Int[Array, " lane"]:
     """Draw a role: green and blue first, then plain or red, and at most one red (util.get_role)."""
-    present = [(level.model.active & (level.role == role)).any(0) for role in (Role.GREEN, Role.BLUE, Role.RED)]
-    complete = present[0] & present[1]
-    red = jnp.where(complete & ~present[2] & red_allowed, dist.red_weight, 0.0)
-    return pick(jnp.stack([1.0 * complete, 1.0 * ~present[0], 1.0 * ~present[1], red]), u)
+    green, blue, red = (draft.used.roles[role] for role in (Role.GREEN, Role.BLUE, Role.RED))
+    as_red = jnp.where(green & blue & ~red & red_allowed, dist.red_weight, 0.0)
+    return pick([1.0 * (green & blue), 1.0 * ~green, 1.0 * ~blue, as_red], u)
 
 
-def insert(level: Level, p: Proposal) -> Level:
-    """Insert the proposed body and its joint in the first free rows of a level."""
-    polygons, model, state = level.size.polygons, level.model, level.state
-    polygon = first_free(model.active[:polygons]) & p.shape.is_polygon & p.possible
-    circle = first_free(model.active[polygons:]) & ~p.shape.is_polygon & p.possible
-    body = jnp.concatenate([polygon, circle])
-    mass, inertia = shape_mass(p.shape)
-    model = replace(
-        model,
-        active=model.active | body,
-        inverse_mass=put(model.inverse_mass, body, jnp.where(p.fixed, 0.0, inverse(mass))),
-        inverse_inertia=put(model.inverse_inertia, body, jnp.where(p.fixed, 0.0, inverse(inertia))),
-        vertices=put(model.vertices, polygon, corners(p.shape.half)),
-        radius=put(model.radius, circle, p.shape.radius),
+def count_contacts(draft: Draft, p: Proposal) -> Int[Array, " lane"]:
+    """Count the proposed body's contacts with the bodies of the draft."""
+    polygons, circles = draft.size[:2]
+    outline, disc, is_polygon = outline_of(p), WorldCircle(p.position, p.shape.radius), p.shape.is_polygon
+
+    def with_polygon(i, count):
+        other = read_outline(draft, i)
+        contacts = jnp.where(is_polygon, polygon_contacts(other, outline), touch(other, disc))
+        return count + jnp.where(i < draft.used.polygons[...], contacts, 0)
+
+    def with_circle(i, count):
+        body = read_body(draft, polygons + i)
+        other = WorldCircle(body.position, body.reach)
+        touching = jnp.where(is_polygon, touch(outline, other), discs_touch(other, disc))
+        return count + (touching & (i < draft.used.circles[...]))
+
+    none = jnp.zeros_like(p.role)
+    count = jax.lax.fori_loop(0, polygons, with_polygon, none)
+    return jax.lax.fori_loop(0, circles, with_circle, count) if circles else count
+
+
+def insert(draft: Draft, p: Proposal, turn: Scalar) -> None:
+    """Insert the proposed body and its joint into the next free rows."""
+    rows, used, notes, polygons = draft.rows, draft.used, draft.notes, draft.size.polygons
+    polygon, circle = p.possible & p.shape.is_polygon, p.possible & ~p.shape.is_polygon
+    body = jnp.where(polygon, used.polygons[...], jnp.where(circle, polygons + used.circles[...], NOBODY))
+    joins = p.joined & p.possible
+    group = gather(polygons + draft.size.circles, lambda i: notes.group[i], jnp.where(joins, p.joint.target, body))
+    (mass, inertia), local, radius = shape_mass(p.shape), corners(p.shape.half), p.shape.radius
+    half = unvec(p.shape.half)
+    put(
+        body,
+        (rows.active, True),
+        (rows.role, p.role),
+        (rows.inverse_mass, jnp.where(p.fixed, 0.0, inverse(mass))),
+        (rows.inverse_inertia, jnp.where(p.fixed, 0.0, inverse(inertia))),
+        (rows.position, unvec(p.position)),
+        (rows.rotation, p.rotation),
+        (notes.turn, turn),
+        (notes.group, group),
+        (notes.cos_sin, jnp.stack(cos_sin(p.rotation))),
+        (notes.low, jnp.where(polygon, -half, 0.0)),
+        (notes.high, jnp.where(polygon, half, 0.0)),
+        (notes.reach, jnp.where(polygon, 0.0, radius)),
+        first=FIXED_POLYGONS,
     )
-    state = replace(
-        state,
-        position=put(state.position, body, unvec(p.position)),
-        rotation=put(state.rotation, body, p.rotation),
-    )
-    level = replace(level, model=model, state=state, role=put(level.role, body, p.role))
-    return _insert_joint(level, p, body) if level.size.joints else level
+    put(body, (rows.vertices, unvec(local)), *outline_changes(draft, outline_of(p)), first=FIXED_POLYGONS)
+    if draft.size.circles:
+        put(body - polygons, (rows.radius, radius))
+    for role in range(used.roles.shape[0]):
+        used.roles[role] |= p.possible & (p.role == role)
+    if draft.size.joints:
+        _insert_joint(draft, p, body, joins)
+    used.polygons[...] += polygon
+    used.circles[...] += circle
 
 
-def _insert_joint(level: Level, p: Proposal, body: Bool[Array, "body lane"]) -> Level:
+def _insert_joint(draft: Draft, p: Proposal, body: Int[Array, " lane"], joins: Flag) -> None:
     """Insert the proposal's joint; its first body is the one with the smaller index, as in the reference."""
-    model, joint = level.model, p.joint
-    row = first_free(model.joint_active) & p.joined
-    indices = jnp.arange(level.size.bodies)[:, None]
-    own, target = at(indices, body), at(indices, joint.target)
-    target_first = target < own
+    rows, used, joint = draft.rows, draft.used, p.joint
+    target_first = joint.target < body
     first, second = (
         where(target_first, joint.target_anchor, joint.anchor),
         where(target_first, joint.anchor, joint.target_anchor),
     )
-    rotation = p.rotation - at(level.state.rotation, joint.target)
-    rotation = jnp.where(joint.joint_fixed, jnp.where(target_first, rotation, -rotation), 0.0)
-    copied = {name: put(vars(model)[name], row, x) for name, x in joint._asdict().items() if name in vars(model)}
-    model = replace(
-        model,
-        **copied,
-        joint_active=model.joint_active | row,
-        joint_a=put(model.joint_a, row, jnp.minimum(own, target)),
-        joint_b=put(model.joint_b, row, jnp.maximum(own, target)),
-        joint_anchor_a=put(model.joint_anchor_a, row, unvec(first)),
-        joint_anchor_b=put(model.joint_anchor_b, row, unvec(second)),
-        joint_rotation=put(model.joint_rotation, row, rotation),
+    turned = p.rotation - gather(draft.size.bodies, lambda i: rows.rotation[i], joint.target)
+    resting = jnp.where(joint.joint_fixed, jnp.where(target_first, turned, -turned), 0.0)
+    copied = [(getattr(rows, name), x) for name, x in joint._asdict().items() if name in rows._fields]
+    put(
+        jnp.where(joins, used.joints[...], NOBODY),
+        (rows.joint_active, True),
+        (rows.joint_a, jnp.minimum(body, joint.target)),
+        (rows.joint_b, jnp.maximum(body, joint.target)),
+        (rows.joint_anchor_a, unvec(first)),
+        (rows.joint_anchor_b, unvec(second)),
+        (rows.joint_rotation, resting),
+        *copied,
     )
-    return replace(level, model=model, motor_binding=put(level.motor_binding, row, joint.motor_binding))
-
-
-def turned(v: Vec, angle: Lane) -> Vec:
-    return v.rotate(jnp.cos(angle), jnp.sin(angle))
+    ends = [jnp.where(joins, end, NOBODY) for end in (body, joint.target)]
+    scatter_add(draft.notes.joints, *((end, jnp.ones_like(p.rotation)) for end in ends))
+    used.joints[...] += joins
+    used.revolute[...] += joins & ~joint.joint_fixed

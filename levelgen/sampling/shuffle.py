@@ -3,64 +3,106 @@
 Follows `kinetix.environment.utils.permute_state` 3.0.2 and `jax2d.engine.calculate_collision_matrix` 1.0.1.
 """
 
-from dataclasses import is_dataclass, replace
-from typing import NamedTuple, TypeVar, get_type_hints
+from typing import NamedTuple, get_type_hints
 
+import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Int
 
-from levelproof.levelgen.level import Level
+from levelproof.levelgen.sampling.draft import Draft, LevelRows
+from levelproof.physics.lanes import Ref, Scalar, each, gather
+from levelproof.physics.lanes import Rows as Readable
 from levelproof.physics.types import FIXED_POLYGONS, Model, Size
 
-T = TypeVar("T")
 
+class NewOrder(NamedTuple):
+    """The new row of each old body, joint and thruster; and the group of joined bodies in each new row."""
 
-class OrderDraws(NamedTuple):
-    """Random numbers for a random order: one for each row of every kind."""
-
-    order: Float[Array, "row lane"]
+    body: Int[Ref, "body lane"]
+    joint: Int[Ref, "joint lane"]
+    thruster: Int[Ref, "thruster lane"]
+    group: Int[Ref, "body lane"]
 
 
 def shuffled_rows(size: Size) -> tuple[int, int, int, int]:
-    """Return the number of shuffled rows of each kind."""
+    """Return the number of shuffled rows of each kind: polygons but for the scenery, circles, joints, thrusters."""
     return size.polygons - FIXED_POLYGONS, size.circles, size.joints, size.thrusters
 
 
-def shuffle(level: Level, draws: OrderDraws) -> Level:
-    """Shuffle movable polygons, circles, joints and thrusters, each among themselves; the scenery stays."""
-    model, order = level.model, draw_order(level.size, draws.order)
-    row_of = jnp.argsort(order["body"], 0)  # the inverse permutation: new row of each old one
-    model = replace(
-        model,
-        joint_a=_take(row_of, model.joint_a),
-        joint_b=_take(row_of, model.joint_b),
-        thruster_body=_take(row_of, model.thruster_body),
-    )
-    level = _in_order(replace(level, model=model), order)
-    return replace(level, model=replace(level.model, collides=collision_matrix(level.model)))
+def shuffle(draft: Draft, order: NewOrder, numbers: Readable, first: int, after: LevelRows, collides: Ref) -> None:
+    """Write the draft's rows to `after`, each kind in the order of its `numbers`; the scenery stays.
+
+    Bodies that joints hold together do not collide. `numbers` has one row for each of `shuffled_rows`, kind after kind,
+    from `first` on.
+    """
+    size = draft.size
+    each(FIXED_POLYGONS, lambda i: _stay(order.body, i))
+    starts = ((order.body, FIXED_POLYGONS), (order.body, size.polygons), (order.joint, 0), (order.thruster, 0))
+    for (new_row, start), count in zip(starts, shuffled_rows(size), strict=True):
+        _rank(numbers, first, count, new_row, start)
+        first += count
+    kinds = {"body": (order.body, 0), "joint": (order.joint, 0), "thruster": (order.thruster, 0)}
+    kinds |= {"polygon": (order.body, 0), "circle": (order.body, size.polygons)}
+    for kind, (new_row, start) in kinds.items():
+        named = [name for name, hint in get_type_hints(LevelRows).items() if hint.dim_str.split()[0] == kind]
+        fields = [(getattr(draft.rows, name), getattr(after, name)) for name in named]
+        _move(fields + [(draft.notes.group, order.group)] * (kind == "body"), new_row, start)
+    for ends in (after.joint_a, after.joint_b, after.thruster_body):
+        _follow(ends, order.body)
+    _let_groups_collide(order.group, collides)
 
 
-def draw_order(size: Size, numbers: Float[Array, "row lane"]) -> dict[str, Int[Array, "row lane"]]:
-    """Return, for each axis by its name in annotations, the row from which each row's content comes."""
-    drawn = jnp.split(numbers, np.cumsum(shuffled_rows(size))[:-1])
-    polygons, circles, joints, thrusters = (jnp.argsort(part, 0).astype(jnp.int32) for part in drawn)
-    scenery = jnp.broadcast_to(jnp.arange(FIXED_POLYGONS)[:, None], (FIXED_POLYGONS, numbers.shape[-1]))
-    polygons = jnp.concatenate([scenery, polygons + FIXED_POLYGONS])
-    bodies = jnp.concatenate([polygons, circles + size.polygons])
-    return {"body": bodies, "polygon": polygons, "circle": circles, "joint": joints, "thruster": thrusters}
+def _stay(new_row: Ref, i: Scalar) -> None:
+    new_row[i] = jnp.zeros_like(new_row[i]) + i
 
 
-def _in_order(arrays: T, order: dict[str, Int[Array, "row lane"]]) -> T:
-    """Reorder the rows of every array of a dataclass whose first axis is in `order`."""
-    reordered = {}
-    for name, hint in get_type_hints(type(arrays)).items():
-        values = getattr(arrays, name)
-        if is_dataclass(values):
-            reordered[name] = _in_order(values, order)
-        elif (axis := hint.dim_str.split()[0]) in order:
-            reordered[name] = _take(values, order[axis])
-    return replace(arrays, **reordered)  # pyright: ignore[reportArgumentType]
+def _rank(numbers: Readable, first: int, count: int, new_row: Ref, start: int) -> None:
+    """Write `start` plus the rank of each of `count` numbers, from `first` on; of two equals, the earlier is lower."""
+
+    def one(i):
+        mine = numbers[first + i]
+
+        def before(j, rank):
+            other = numbers[first + j]
+            return rank + ((other < mine) | ((other == mine) & (j < i)))
+
+        new_row[start + i] = jax.lax.fori_loop(0, count, before, jnp.full_like(new_row[start + i], start))
+
+    each(count, one)
+
+
+def _move(fields: list[tuple[Ref, Ref]], new_row: Ref, start: int) -> None:
+    """Copy row i of `before` to row new_row[start + i] - start of `after`, for each (before, after) in `fields`."""
+    count = fields[0][0].shape[0]
+
+    def fill(k):
+        def copy_if_here(i):
+            here = new_row[start + i] == start + k
+            for before, after in fields:
+                after[k] = jnp.where(here, before[i], after[k])
+
+        each(count, copy_if_here)
+
+    each(count, fill)
+
+
+def _follow(ends: Ref, new_row: Ref) -> None:
+    """Replace indices of bodies by their new ones."""
+
+    def one(i):
+        ends[i] = gather(new_row.shape[0], lambda body: new_row[body], ends[i])
+
+    each(ends.shape[0], one)
+
+
+def _let_groups_collide(group: Readable, collides: Ref) -> None:
+    """Write which bodies may collide: those of different groups."""
+
+    def pair(i, j):
+        collides[i, j] = group[i] != group[j]
+
+    count = collides.shape[0]
+    each(count, lambda i: each(count, lambda j: pair(i, j)))
 
 
 def collision_matrix(model: Model) -> Bool[Array, "body body lane"]:
@@ -76,9 +118,3 @@ def collision_matrix(model: Model) -> Bool[Array, "body body lane"]:
     for _ in range((model.size.joints - 1).bit_length()):  # chains of 1, 2, 4 ... joints
         joined = (joined[:, :, None] & joined[None]).any(1)
     return ~joined
-
-
-def _take(x: Array, index: Int[Array, "row lane"]) -> Array:
-    """Return x [row, ..., lane] at each lane's own rows."""
-    spread = index.reshape(len(index), *[1] * (x.ndim - 2), index.shape[-1])
-    return jnp.take_along_axis(x, spread, 0)

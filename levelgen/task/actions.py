@@ -1,7 +1,7 @@
 """Actions and what they do: one entry per binding, obeyed by every actuator bound to it.
 
 An action is multi-discrete: MOTOR_BINDINGS entries for motors (0 off, 1 forward, 2 backward), then
-THRUSTER_BINDINGS entries for thrusters (0 off, 1 on). Environments take two other kinds, too: discrete (one
+THRUSTER_BINDINGS entries for thrusters (0 off, 1 on). Environments also accept two other kinds: discrete (one
 binding at a time) and continuous. Facts: `kinetix.environment.utils` 3.0.2.
 """
 

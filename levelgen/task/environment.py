@@ -1,7 +1,7 @@
 """One environment with the interface of gymnax and of the reference, played on our levels.
 
 `env.reset(key, params)` and `env.step(key, state, action, params)` are functions of ONE environment, to be mapped
-with `jax.vmap`; the mapped axis becomes the engine's lanes (`levelgen.task.vmapped`). A step that ends an episode
+with `jax.vmap`; the mapped axis becomes the engine's lanes (`levelgen.vmapped`). A step that ends an episode
 resets: to a level drawn from `params.levels`, or to `override_reset_state`.
 
 The level that a reset draws depends on its key, the episode's number and a tag of its own. So callers that pass one
@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from levelproof.levelgen.level import ACTIONS, Level
+from levelproof.levelgen.sampling.sampler import Sampler
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import (
     CHOICES,
@@ -30,12 +31,13 @@ from levelproof.levelgen.task.actions import (
     controls,
     discrete_controls,
 )
+from levelproof.levelgen.task.fresh import renewed
 from levelproof.levelgen.task.observe.entities import entities, padded_shape, symbolic_padded
 from levelproof.levelgen.task.observe.flat import LIMIT, feature_count, symbolic_flat
 from levelproof.levelgen.task.observe.pixels import SIDE, pixels
 from levelproof.levelgen.task.rules import TaskParams, TaskState
 from levelproof.levelgen.task.spaces import Box, Dict, Discrete, MultiDiscrete, Space
-from levelproof.levelgen.task.vmapped import single
+from levelproof.levelgen.vmapped import single
 from levelproof.physics.bounds import require_32_bits
 from levelproof.physics.types import Size
 
@@ -62,9 +64,12 @@ class ObservationType(StrEnum):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class EnvParams:
-    """Parameters that may change without recompiling: the levels that resets draw from (level axis last; not empty)."""
+    """Parameters: what resets draw levels from.
 
-    levels: Level
+    Levels (level axis last; not empty) may change without recompiling. A Sampler makes a new level for every reset.
+    """
+
+    levels: Level | Sampler
 
 
 @jax.tree_util.register_dataclass
@@ -72,10 +77,10 @@ class EnvParams:
 class EnvState:
     """One environment, without an axis of lanes: its level, and the episode under way."""
 
-    level: Level  # its world as it is now
+    level: Level  # with the present state of its world
     timestep: Int[Array, ""]  # env steps taken in this episode
     last_distance: Float[Array, ""]  # m, between green and blue; NO_DISTANCE at the start
-    level_index: Int[Array, ""]  # into `params.levels`, or into the levels that `starts` was called with
+    level_index: Int[Array, ""]  # into `params.levels`, or a Sampler's level id, or into the levels of `starts`
     episode: Int[Array, ""]  # automatic resets since `reset`
 
     @property
@@ -112,7 +117,7 @@ OBSERVE: dict[ObservationType, Callable[..., Any]] = {
 
 
 def make(
-    levels: Level,
+    levels: Level | Sampler,
     action_type: str = ActionType.MULTI_DISCRETE,
     observation_type: str = ObservationType.SYMBOLIC_FLAT,
     rules: TaskParams = task.DEFAULT_RULES,
@@ -122,7 +127,8 @@ def make(
     """Make an environment; return it with its default parameters.
 
     Args:
-        levels: resets draw from these uniformly; level axis last.
+        levels: levels from which resets draw uniformly, level axis last; or a Sampler, from which every reset draws a
+            new level.
         action_type: one of ActionType.
         observation_type: one of ObservationType.
         rules: rules of the task.
@@ -136,9 +142,10 @@ def make(
     for kinds, name in (ActionType, action_type), (ObservationType, observation_type):
         if name not in [*kinds]:
             raise ValueError(f"there is no {kinds.__name__} {name!r}: choose one of {', '.join(kinds)}")
-    if not len(levels):
-        raise ValueError("there are no levels to reset to: give at least one")
-    levels = jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x), (*x.shape[:-1], len(levels))), levels)
+    if isinstance(levels, Level):
+        if not (count := len(levels)):
+            raise ValueError("there are no levels to reset to: give at least one")
+        levels = jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x), (*x.shape[:-1], count)), levels)
     env = Environment(
         levels, ActionType(action_type), ObservationType(observation_type), rules, auto_reset, final_observation
     )
@@ -158,7 +165,7 @@ def starts(levels: Level) -> EnvState:
 class Environment:
     """An environment, created by `make`. Equal only to itself, so it can be a static argument."""
 
-    levels: Level
+    levels: Level | Sampler
     action_type: ActionType
     observation_type: ObservationType
     rules: TaskParams
@@ -210,8 +217,8 @@ class Environment:
             distance: between green and blue at the end of the step, m.
             terminated: whether the task ended the episode; the value of the next state is then 0.
             truncated: whether the time limit ended it; a value function bootstraps from the final observation.
-            level_index: index of the step's level in `params.levels` (as `EnvState.level_index`).
-            final_observation: observation at the end of the step, before any reset; if `make` was asked for it.
+            level_index: index of the step's level in `params.levels`, or its id (as `EnvState.level_index`).
+            final_observation: observation at the end of the step, before any reset; only if `make` was asked for it.
         """
         self._check(action)
         if not self.auto_reset:
@@ -265,6 +272,8 @@ class Environment:
         if override is not None:
             return (), 0, override
         levels = (params or self.default_params).levels
+        if isinstance(levels, Sampler):
+            return levels, levels.draw_id(_level_key(key, episode)), None
         return levels, _draw_level(key, episode, levels.state.rotation.shape[-1]), None
 
     def _reset_lanes(
@@ -279,7 +288,7 @@ class Environment:
 
         Args:
             levels: as `_restart` returns them; () for no reset.
-            row: of the level to reset to. Where the caller maps over `params`, `levels` holds those of all lanes.
+            row: of the level to reset to. If the caller maps over `params`, `levels` holds the levels of all lanes.
             inputs: (override state or None, index that `_restart` returned, state, action).
         """
         override, index, state, action = inputs
@@ -290,7 +299,10 @@ class Environment:
         info |= {"truncated": result.done & ~closing.terminated, "level_index": state.level_index}
         if self.final_observation:
             info["final_observation"] = self._observe(after)
-        if override is not None or isinstance(levels, Level):
+        if override is None and isinstance(levels, Sampler):
+            begin = lambda ids: EnvState.start(levels.lanes(ids), ids)
+            after = replace(renewed(result.done, index, begin, after), episode=state.episode + result.done)
+        elif override is not None or isinstance(levels, Level):
             restart = _first_state(levels, row, index, state.episode + 1, override)
             after = jax.tree.map(lambda fresh, x: jnp.where(result.done, fresh, x), restart, after)
         return self._observe(after), after, result.reward, result.done, info
@@ -308,8 +320,11 @@ def _draw_level(key: Key[Array, ""], episode: Int[Array, ""] | int, count: int) 
     """Draw the index of an episode's level, from a key that nothing else uses (see the module's docstring)."""
     if count == 1:
         return 0
-    bits = jax.random.bits(jax.random.fold_in(key, LEVEL_DRAW + episode))
-    return (bits % count).astype(jnp.int32)  # uneven by less than count / 2**32
+    return (jax.random.bits(_level_key(key, episode)) % count).astype(jnp.int32)  # uneven by less than count / 2**32
+
+
+def _level_key(key: Key[Array, ""], episode: Int[Array, ""] | int) -> Key[Array, ""]:
+    return jax.random.fold_in(key, LEVEL_DRAW + episode)
 
 
 def _first_state(
@@ -322,6 +337,8 @@ def _first_state(
     """Start an episode of the level in `row`, which the episode's own `params.levels` has at `index`."""
     if override is not None:
         return override
+    if isinstance(levels, Sampler):
+        return EnvState.start(levels.lanes(index), index, episode)
     return EnvState.start(jax.tree.map(lambda x: x[..., row], levels), index, episode)
 
 

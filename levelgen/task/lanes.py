@@ -13,8 +13,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from levelproof.levelgen.level import Level
+from levelproof.levelgen.sampling.sampler import Sampler
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.environment import CONTROLS, OBSERVE, Environment, EnvParams, ObservationType
+from levelproof.levelgen.task.fresh import renewed
 from levelproof.levelgen.task.observe.flat import level_features, symbolic_flat
 from levelproof.levelgen.task.rules import TaskState
 
@@ -26,7 +28,7 @@ class LevelTable:
 
     level: Level  # its constant arrays; `state` is None
     start: TaskState | None  # first state of an episode in each level; None for levels that lanes play
-    features: Float[Array, "feature level"]  # constant part of the symbolic-flat observation; no rows for others
+    features: Float[Array, "feature level"]  # constant part of the symbolic-flat observation; no rows for other types
 
 
 @jax.tree_util.register_dataclass
@@ -38,6 +40,7 @@ class LaneState:
     level_index: Int[Array, " lane"]  # into the table
 
 
+Table = LevelTable | Sampler
 LaneStep = tuple[Any, LaneState, LevelTable, Float[Array, " lane"], Bool[Array, " lane"], dict[str, Any]]
 
 
@@ -46,30 +49,38 @@ class Lanes:
     """An environment (`levelproof.make`) stepped in lanes: its rules, actions and observations, batch axis last.
 
     `table` is computed once from parameters. `reset` starts episodes and returns `played`: each lane's own columns of
-    the table, which every `step` takes and returns. `take` returns them for any state.
+    the table, which every `step` takes and returns. `take` returns these columns for any level indices.
     """
 
     env: Environment
 
-    def table(self, params: EnvParams | None = None) -> LevelTable:
-        """Build the table of the levels of `params`."""
-        level = (params or self.env.default_params).levels
+    def table(self, params: EnvParams | None = None) -> Table:
+        """Build the table of the levels of `params`; a Sampler is its own table, indexed by level id."""
+        levels = (params or self.env.default_params).levels
+        return levels if isinstance(levels, Sampler) else self._table(levels)
+
+    def _table(self, level: Level) -> LevelTable:
         flat = self.env.observation_type == ObservationType.SYMBOLIC_FLAT
         features = level_features(level) if flat else jnp.zeros((0, len(level)))
         return LevelTable(_constant(level), task.reset(level), features)
 
-    def take(self, table: LevelTable, level_index: Int[Array, " lane"]) -> LevelTable:
+    def take(self, table: Table, level_index: Int[Array, " lane"]) -> LevelTable:
         """Return the table's columns at `level_index`, one for each lane."""
-        return jax.tree.map(lambda x: x[..., level_index], replace(table, start=None))
+        return replace(self._columns(table, level_index), start=None)
 
-    def reset(self, table: LevelTable, level_index: Int[Array, " lane"]) -> tuple[Any, LaneState, LevelTable]:
+    def _columns(self, table: Table, level_index: Int[Array, " lane"]) -> LevelTable:
+        if isinstance(table, Sampler):
+            return self._table(table.lanes(level_index))
+        return jax.tree.map(lambda x: x[..., level_index], table)
+
+    def reset(self, table: Table, level_index: Int[Array, " lane"]) -> tuple[Any, LaneState, LevelTable]:
         """Start an episode in every lane; return (observation, state, played)."""
-        played = self.take(table, level_index)
-        state = LaneState(jax.tree.map(lambda x: x[..., level_index], table.start), level_index)
+        columns = self._columns(table, level_index)
+        played, state = replace(columns, start=None), LaneState(_start_of(columns), level_index)
         return self.observe(state, played), state, played
 
     def step(
-        self, table: LevelTable, played: LevelTable, state: LaneState, action: Array, next_index: Int[Array, " lane"]
+        self, table: Table, played: LevelTable, state: LaneState, action: Array, next_index: Int[Array, " lane"]
     ) -> LaneStep:
         """Take one env step in every lane; return (observation, state, played, reward, done, info).
 
@@ -78,7 +89,8 @@ class Lanes:
             played: each lane's level, as `reset` or the previous step returned it.
             state: the episodes under way.
             action: actions of the environment's type, lanes last: int [lane], int [6, lane] or float [6, lane].
-            next_index: index in the table of the level that a lane starts if this step ends its episode.
+            next_index: index in the table of the level that a lane starts if this step ends its episode; for a
+                Sampler, the level's id.
 
         `info` has the entries of `Environment.step`, lanes last. No gradient flows through the world.
         """
@@ -93,7 +105,7 @@ class Lanes:
             info["final_observation"] = self.observe(after, played)
         if env.auto_reset:
             after = LaneState(now, jnp.where(result.done, next_index.astype(jnp.int32), state.level_index))
-            after, played = _started(table, played, after, result.done)
+            after, played = self._started(table, played, after, result.done)
         return self.observe(after, played), after, played, result.reward, result.done, info
 
     def observe(self, state: LaneState, played: LevelTable) -> Any:
@@ -103,27 +115,19 @@ class Lanes:
         world = state.now.state
         return OBSERVE[self.env.observation_type](replace(played.level, state=world), world)
 
+    def _started(
+        self, table: Table, played: LevelTable, state: LaneState, done: Bool[Array, " lane"]
+    ) -> tuple[LaneState, LevelTable]:
+        """Start the levels at `state.level_index` in the lanes that are done."""
+        before = replace(played, start=state.now)
+        columns = renewed(done, state.level_index, lambda ids: self._columns(table, ids), before)
+        return replace(state, now=_start_of(columns)), replace(columns, start=None)
+
 
 def _constant(level: Level) -> Level:
     return replace(level, state=None)  # pyright: ignore[reportArgumentType]
 
 
-def _started(
-    table: LevelTable, played: LevelTable, state: LaneState, done: Bool[Array, " lane"]
-) -> tuple[LaneState, LevelTable]:
-    """Copy the table's columns into the lanes that start an episode, lane by lane: in any one step they are few.
-
-    A select over all lanes would read and write every level in every step, which takes as long as the step itself.
-    """
-
-    def start_one(carry: tuple) -> tuple:
-        waiting, now, played = carry
-        lane = jnp.argmax(waiting)
-        column = lambda x: jax.lax.dynamic_slice_in_dim(x, state.level_index[lane], 1, -1)
-        write = lambda x, one: jax.lax.dynamic_update_slice_in_dim(x, one, lane, -1)
-        chosen = jax.tree.map(column, table)
-        now, played = jax.tree.map(write, (now, played), (chosen.start, replace(chosen, start=None)))
-        return waiting.at[lane].set(False), now, played
-
-    _, now, played = jax.lax.while_loop(lambda carry: carry[0].any(), start_one, (done, state.now, played))
-    return replace(state, now=now), played
+def _start_of(columns: LevelTable) -> TaskState:
+    """Return the first states in columns that have them."""
+    return columns.start  # pyright: ignore[reportReturnType]

@@ -12,11 +12,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from levelproof.levelgen.level import Level, Role
 from levelproof.levelgen.task.actions import Controls, controls
+from levelproof.levelgen.task.measures import goal_distance
 from levelproof.physics.bounds import require
 from levelproof.physics.pairs import pairs_of
 from levelproof.physics.step import step as physics_step
 from levelproof.physics.types import Params, State
-from levelproof.physics.vector import rows, select, vec
+from levelproof.physics.vector import rows, select
 
 MAX_STEPS = 10**6
 NO_DISTANCE = -1.0  # last_distance before the first step of an episode
@@ -80,7 +81,7 @@ def has_roles(level: Level, a, b, first: Role, second: Role) -> Bool[Array, "pai
 def touches(level: Level, active: Bool[Array, "contact lane"], first: Role, second: Role) -> Bool[Array, " lane"]:
     """Whether bodies of these roles are in contact.
 
-    What counts is the first contact point of a polygon pair, or the contact of a pair with a circle.
+    For a pair of polygons, only the first contact point counts; for a pair with a circle, its one contact.
     """
     pairs = pairs_of(level.size)
     n, m = len(pairs.polygon), len(pairs.circle_polygon)
@@ -93,17 +94,6 @@ def touches(level: Level, active: Bool[Array, "contact lane"], first: Role, seco
     return jnp.stack(hits).any(0)
 
 
-def goal_distance(level: Level, state: State) -> Float[Array, " lane"]:
-    """Return the distance between the centres of green and blue, summed over all such pairs that may touch, m."""
-    position, pairs = vec(state.position), pairs_of(level.size)
-    total = jnp.zeros(state.rotation.shape[-1])
-    for pair in (pairs.polygon, pairs.circle_polygon, pairs.circle):
-        if len(pair):
-            between = position.map(lambda x, p=pair: rows(x, p.a) - rows(x, p.b))
-            total += jnp.where(has_roles(level, pair.a, pair.b, Role.GREEN, Role.BLUE), between.norm(), 0.0).sum(0)
-    return total
-
-
 def advance(
     level: Level, now: TaskState, action: Int[Array, "6 lane"], params: TaskParams
 ) -> tuple[TaskState, StepResult]:
@@ -112,16 +102,16 @@ def advance(
 
 
 def advance_driven(
-    level: Level, now: TaskState, driven: Controls, params: TaskParams, seen: bool = False
+    level: Level, now: TaskState, driven: Controls, params: TaskParams, with_contacts: bool = False
 ) -> tuple[TaskState, StepResult, StepEnd, Any]:
     """Take one env step without reset under controls, whatever type of action they come from.
 
-    Returns the next state, the result, the step's end, and the contacts of the last physics step, if `seen`.
+    Returns the next state, the result, the step's end, and the contacts of the last physics step, if `with_contacts`.
     """
     motor, thrust = driven
 
     def frame(state, _):
-        state, manifold = physics_step(level.model, state, motor, thrust, params.physics, seen)
+        state, manifold = physics_step(level.model, state, motor, thrust, params.physics, with_contacts)
         fail = touches(level, state.contact_active, Role.GREEN, Role.RED)
         goal = touches(level, state.contact_active, Role.GREEN, Role.BLUE) & ~fail
         return state, (goal, fail, goal_distance(level, state), manifold)

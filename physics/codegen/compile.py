@@ -64,7 +64,7 @@ def _block(module: ir.Module, jaxpr: core.ClosedJaxpr, buffers: Sequence[Buffer]
     b = ir.IRBuilder(function.append_basic_block("entry"))
     memories = []
     for i, (buffer, pointer) in enumerate(zip(buffers, function.args[1:], strict=True)):
-        stride = INDEX(1) if not buffer.lanes else function.args[0] if i < outside else INDEX(LANES)
+        stride = 1 if not buffer.lanes else function.args[0] if i < outside else LANES
         memories.append(Memory(pointer, buffer.shape, buffer.dtype, buffer.lanes, stride))
     lower(b, jaxpr, memories)
     b.ret_void()

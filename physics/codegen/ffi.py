@@ -31,7 +31,7 @@ def _structure(name: str, **fields: Any) -> Any:
 
 ExtensionBase = _structure("XLA_FFI_Extension_Base", struct_size=c_size_t, type=c_int, next=c_void_p)
 ApiVersion = _structure("XLA_FFI_Api_Version", **START, major_version=c_int, minor_version=c_int)
-# What XLA queries. It passes the structure with traits and state unset, which holds for this handler: leave them
+# What XLA queries. It passes the structure with traits and state unset; this handler has neither, so leave them
 Metadata = _structure("XLA_FFI_Metadata", struct_size=c_size_t, api_version=ApiVersion, traits=c_uint32)
 MetadataExtension = _structure("XLA_FFI_Metadata_Extension", extension_base=ExtensionBase, metadata=c_void_p)
 FrameBuffer = _structure("XLA_FFI_Buffer", **START, dtype=c_int, data=c_void_p, rank=c_int64, dims=c_void_p)

@@ -27,14 +27,25 @@ class Memory:
     shape: tuple[int, ...]  # without the lanes
     dtype: str
     lanes: bool
-    stride: Operand  # elements from row to row
+    stride: Operand | int  # elements from row to row
 
     def at(self, b: ir.IRBuilder, index: Sequence) -> Operand:
         """Emit the address of a row."""
-        row = INDEX(0)
-        for number, size in zip(index, self.shape, strict=True):
-            row = b.add(b.mul(row, INDEX(size)), INDEX(number) if isinstance(number, int) else b.sext(number, INDEX))
-        return b.gep(self.pointer, [b.mul(row, self.stride)], source_etype=STORED[self.dtype])
+        known, step, row = 0, 1, None  # the row's index is the constant `known` plus `row`, known only at run time
+        for number, size in reversed([*zip(index, self.shape, strict=True)]):
+            if isinstance(number, int):
+                known += number * step
+            else:
+                part = b.mul(b.sext(number, INDEX), INDEX(step))
+                row = part if row is None else b.add(row, part)
+            step *= size
+        stride = INDEX(self.stride) if isinstance(self.stride, int) else self.stride
+        if row is None and isinstance(self.stride, int):
+            offset = INDEX(known * self.stride)
+        else:
+            row = INDEX(known) if row is None else b.add(row, INDEX(known)) if known else row
+            offset = b.mul(row, stride)
+        return b.gep(self.pointer, [offset], source_etype=STORED[self.dtype])
 
 
 def lower(b: ir.IRBuilder, jaxpr: core.ClosedJaxpr, arguments: Sequence[Value | Memory]) -> list[Value]:
@@ -84,6 +95,10 @@ def _equation(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list:
             return [_swap(b, params, operands)]
         case "convert_element_type":
             return [primitives.convert(b, operands[0], str(params["new_dtype"]))]
+        case "bitcast_convert_type":
+            return [primitives.bitcast(b, operands[0], str(params["new_dtype"]))]
+        case "integer_pow":
+            return [primitives.integer_pow(b, operands[0], params["y"])]
         case "broadcast_in_dim":
             return [primitives.broadcast_in_dim(b, operands[0], params["shape"], params["broadcast_dimensions"])]
         case "reshape" | "squeeze":
@@ -98,7 +113,7 @@ def _equation(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list:
             return [primitives.reduction(b, name, operands[0], params["axes"], str(out.dtype))]
         case "iota":
             return [primitives.iota(params["shape"], params["dimension"], str(params["dtype"]))]
-        case "new_ref" if isinstance(operands[0], Memory):  # to an argument: the argument itself
+        case "new_ref" if isinstance(operands[0], Memory):  # a reference to an argument is the argument itself
             return operands
     raise NotImplementedError(f"a kernel cannot use the primitive {name}")
 
@@ -273,7 +288,7 @@ def _cond(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list[Valu
 
 
 def _call(parameter: str) -> Callable[[ir.IRBuilder, core.JaxprEqn, list], list[Value]]:
-    """Inline the called jaxpr."""
+    """Return a function that inlines the jaxpr in this parameter."""
     return lambda b, equation, operands: lower(b, equation.params[parameter], operands)
 
 

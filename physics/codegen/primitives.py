@@ -10,7 +10,7 @@ import numpy as np
 from llvmlite import ir
 
 from levelproof.physics.codegen.buffers import LANES
-from levelproof.physics.codegen.values import Operand, Value, array, constant, has_lanes, llvm_type, vector
+from levelproof.physics.codegen.values import Operand, Splat, Value, array, constant, has_lanes, llvm_type, vector
 
 Emit = Callable[..., Operand]
 FLOAT, INT, BOOL = "float32", "int32", "bool"
@@ -18,7 +18,7 @@ COMPARE = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
 
 
 def _call(name: str) -> Emit:
-    """Call an LLVM intrinsic from floats to a float."""
+    """Return a function that emits a call of an LLVM intrinsic from floats to a float."""
 
     def emit(b, *xs):
         kind = xs[0].type
@@ -33,11 +33,13 @@ def _call(name: str) -> Emit:
 
 def _number(x: Operand, number: float) -> ir.Constant:
     """Return a constant of the type of x."""
-    return ir.Constant(x.type, [number] * LANES if isinstance(x.type, ir.VectorType) else number)
+    lanes = isinstance(x.type, ir.VectorType)
+    scalar = ir.Constant(x.type.element if lanes else x.type, number)
+    return Splat(scalar) if lanes else scalar
 
 
 def _extreme(order: str) -> Emit:
-    """Return max or min of floats: like XLA's, NaN if either is NaN; y if both are zeros of any sign."""
+    """Return a function that emits max or min of floats: as in XLA, NaN if either is NaN; y if both are zeros."""
 
     def emit(b, x, y):
         chosen = b.select(b.fcmp_ordered(order, x, y), x, y)  # y if either is NaN
@@ -67,6 +69,17 @@ def _select(b, condition, x, y):
     return b.select(condition, y, x)
 
 
+def _shift(name: str) -> dict[str, Emit]:
+    """Return a function that emits a shift by a constant, known to be below 32: LLVM leaves longer shifts undefined."""
+
+    def emit(b, x, y):
+        if not isinstance(y, ir.Constant) or not 0 <= y.constant < 32:
+            raise NotImplementedError("a kernel shifts by a constant from 0 to 31")
+        return getattr(b, name)(x, y)
+
+    return {INT: emit}
+
+
 def _bits(name: str) -> dict[str, Emit]:
     return dict.fromkeys((INT, BOOL), lambda b, *xs: getattr(b, name)(*xs))
 
@@ -88,7 +101,10 @@ ELEMENTWISE: dict[str, dict[str, Emit]] = {
     "square": {FLOAT: lambda b, x: b.fmul(x, x), INT: lambda b, x: b.mul(x, x)},
     "and": _bits("and_"),
     "or": _bits("or_"),
+    "xor": _bits("xor"),
     "not": _bits("not_"),
+    "shift_left": _shift("shl"),
+    "shift_right_logical": _shift("lshr"),
     "select_n": dict.fromkeys((FLOAT, INT, BOOL), _select),
     **{name: _compare(order) for name, order in COMPARE.items()},
 }
@@ -122,17 +138,59 @@ def with_lanes(b: ir.IRBuilder, x: Value) -> Value:
 
 
 def convert(b: ir.IRBuilder, x: Value, dtype: str) -> Value:
-    """Convert between dtypes: exactly, or to the nearest float."""
+    """Convert between dtypes: exactly, to the nearest float, or towards zero to an integer within its range."""
     if x.dtype == dtype:
         return x
     if dtype == FLOAT:
         emit = b.uitofp if x.dtype == BOOL else b.sitofp
-    elif dtype == INT and x.dtype == BOOL:
-        emit = b.zext
+    elif dtype == INT:
+        emit = b.zext if x.dtype == BOOL else _truncate(b)
     else:
         raise NotImplementedError(f"a kernel cannot convert {x.dtype} to {dtype}")
+    return _each(x, dtype, emit)
+
+
+def bitcast(b: ir.IRBuilder, x: Value, dtype: str) -> Value:
+    """Read the bits of 32-bit numbers as another dtype's. JAX allows it between dtypes of one width only."""
+    return _each(x, dtype, b.bitcast)
+
+
+def integer_pow(b: ir.IRBuilder, x: Value, exponent: int) -> Value:
+    """Multiply x with itself, in the order in which XLA does."""
+    if exponent < 1 or x.dtype != FLOAT:
+        raise NotImplementedError(f"a kernel cannot raise {x.dtype} to the power of {exponent}")
+
+    def power(factor: Operand) -> Operand:
+        total, rest = None, exponent
+        while True:
+            if rest % 2:
+                total = factor if total is None else b.fmul(total, factor)
+            rest //= 2
+            if not rest:
+                return total
+            factor = b.fmul(factor, factor)
+
+    return Value(array(x.rows.shape, lambda at: power(x.rows[at])), x.dtype, x.lanes)
+
+
+def _each(x: Value, dtype: str, emit: Emit) -> Value:
+    """Emit a cast of every element."""
     kind = llvm_type(dtype, x.lanes)
     return Value(array(x.rows.shape, lambda at: emit(x.rows[at], kind)), dtype, x.lanes)
+
+
+def _truncate(b: ir.IRBuilder) -> Emit:
+    """Return a function that converts floats to integers as XLA does: towards zero, NaN to 0, saturating."""
+
+    def emit(x: Operand, kind: ir.Type) -> Operand:
+        width = f"v{LANES}" if isinstance(kind, ir.VectorType) else ""
+        full_name = f"llvm.fptosi.sat.{width}i32.{width}f32"
+        function = b.module.globals.get(full_name)
+        if function is None:
+            function = ir.Function(b.module, ir.FunctionType(kind, [x.type]), full_name)
+        return b.call(function, [x])
+
+    return emit
 
 
 def broadcast_in_dim(b: ir.IRBuilder, x: Value, shape: tuple[int, ...], dimensions: tuple[int, ...]) -> Value:

@@ -39,16 +39,27 @@ def llvm_type(dtype: str, lanes: bool) -> ir.Type:
     return ir.VectorType(element, LANES) if lanes else element
 
 
-def constant(x, dtype: str, lanes: bool = False) -> ir.Constant:
-    """Return a constant number, in every lane if `lanes`."""
-    number = float(x) if dtype == "float32" else int(x)
-    return ir.Constant(llvm_type(dtype, lanes), [number] * LANES if lanes else number)
+class Splat(ir.Constant):
+    """A constant with one number in all lanes; llvmlite's own would write that number LANES times."""
+
+    def __init__(self, number: ir.Constant) -> None:
+        self.type, self.constant, self.number = ir.VectorType(number.type, LANES), number.constant, number
+
+    def _get_reference(self) -> str:
+        return f"splat ({self.number})"
+
+
+def constant(x, dtype: str) -> ir.Constant:
+    """Return a constant number."""
+    return ir.Constant(llvm_type(dtype, False), float(x) if dtype == "float32" else int(x))
 
 
 def vector(builder: ir.IRBuilder, numbers: Sequence[Operand]) -> Operand:
     """Emit a vector of lanes from scalars: one for all lanes, or one each."""
+    if len(numbers) == 1 and isinstance(numbers[0], ir.Constant):
+        return Splat(numbers[0])
     index = ir.IntType(32)
-    undefined = ir.Constant(ir.VectorType(numbers[0].type, LANES), ir.Undefined)
+    undefined = Splat(ir.Constant(numbers[0].type, ir.Undefined))
     filled = undefined
     for lane, number in enumerate(numbers):
         filled = builder.insert_element(filled, number, ir.Constant(index, lane))

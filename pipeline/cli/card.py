@@ -26,5 +26,5 @@ def run(arguments: argparse.Namespace) -> None:
 
     for split in arguments.splits:
         require_folder(split, "write its card")
-    wishes = CardOptions(arguments.license, arguments.name, arguments.repo, arguments.code)
-    card(arguments.splits, arguments.out, wishes)
+    options = CardOptions(arguments.license, arguments.name, arguments.repo, arguments.code)
+    card(arguments.splits, arguments.out, options)

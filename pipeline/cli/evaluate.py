@@ -9,23 +9,32 @@ from levelproof.pipeline.errors import UserError
 SUMMARY = "measure how often a policy solves levels, beside doing nothing and random play"
 EXAMPLE = """\
 levelproof evaluate policy/
-levelproof evaluate policy/ --on data/128k/s --where "label = 'solved'" --attempts 8
+levelproof evaluate policy/ --on data/128k/s --where "label = 'solved'" --start 0 0.5
+levelproof evaluate policy/ --on handmade
+levelproof evaluate policy/ --on sealed/64k/s --experts sealed/16k/s sealed/64k/s
 levelproof evaluate --on my-levels --json"""
-SEALED = "sealed"
 ON = (
-    "split (folder or URL), level file or folder of them, or `sealed`: 2,048 levels that are never trained on (default)"
+    "split (folder or URL), level file or folder of them; `sealed`: 2,048 levels that are never trained on (default); "
+    "`handmade` or `reference-random`: the levels on which the reference publishes solve rates"
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    policy = "folder of a policy that `levelproof clone` wrote (default: only the baselines play)"
+    wrote = "folder of a policy that `levelproof clone` or `levelproof train` wrote"
+    policy = f"{wrote}, or builtin:s (default: only the baselines play)"
     parser.add_argument("policy", type=Path, nargs="?", metavar="POLICY", help=policy)
-    parser.add_argument("--on", default=SEALED, metavar="LEVELS", help=ON)
+    parser.add_argument("--on", default="sealed", metavar="LEVELS", help=ON)
     parser.add_argument("--where", metavar="SQL", help="use only levels of the split that meet this condition")
-    parser.add_argument("--size", nargs="+", default=["s"], help="sizes of the sealed levels (default: s)")
+    size = "sizes of sealed levels (default: s) or of the reference's (default: s m l)"
+    parser.add_argument("--size", nargs="+", help=size)
     parser.add_argument("--levels", type=int, metavar="COUNT", help="use only the first levels of each size")
-    parser.add_argument("--attempts", type=int, default=8, metavar="COUNT", help="attempts at each level (default: 8)")
-    parser.add_argument("--seed", type=int, default=0, help="of the attempts (default: 0)")
+    attempts = "attempts at each level (default: 8; on the reference's levels, as many as the reference makes)"
+    parser.add_argument("--attempts", type=int, metavar="COUNT", help=attempts)
+    parser.add_argument("--seed", type=int, default=0, help="seed of the attempts (default: 0)")
+    start = "where in a split's witnesses attempts start, as shares of the steps to the goal; 0: the start (default)"
+    parser.add_argument("--start", type=float, nargs="+", default=[0.0], metavar="SHARE", help=start)
+    experts = "splits with the same levels, whose experts are listed for comparison"
+    parser.add_argument("--experts", type=Path, nargs="+", default=[], metavar="SPLIT", help=experts)
     add_json(parser)
 
 
@@ -34,21 +43,32 @@ def run(arguments: argparse.Namespace) -> None:
         value = getattr(arguments, name)
         if value is not None and not least <= value < 2**31:
             raise UserError(f"--{name} is {value}: it must be from {least} to {2**31 - 1}.")
-    from levelproof.pipeline.learn.evaluate import evaluate
+    if arguments.experts and any(arguments.start):
+        raise UserError("--experts rates episodes from the levels' start: leave out --start.")
+    for share in arguments.start:
+        if not 0 <= share < 1:
+            raise UserError(f"--start is {share}: it must be from 0 to below 1.")
+    from levelproof.pipeline.learn.evaluate import evaluate, is_named
     from levelproof.pipeline.urls import require_known
 
-    place = None if arguments.on == SEALED else Path(arguments.on)
-    if place is None and arguments.where is not None:
-        raise UserError("--where selects levels of a split: name one with --on.")
-    if place is not None:
-        require_known(place)
+    for split in arguments.experts:
+        require_known(split)
+    if is_named(arguments.on):
+        if arguments.where is not None:
+            raise UserError("--where selects levels of a split: name one with --on.")
+    else:
+        require_known(Path(arguments.on))
+        if arguments.size is not None:
+            raise UserError(f"--size selects sealed levels or the reference's: leave it out for {arguments.on}.")
     evaluate(
         arguments.policy,
-        place,
+        arguments.on,
         arguments.where,
         arguments.size,
         arguments.levels,
         arguments.attempts,
         arguments.seed,
+        [*dict.fromkeys(arguments.start)],
+        arguments.experts,
         arguments.json,
     )

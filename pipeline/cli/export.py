@@ -13,11 +13,12 @@ levelproof export data/128k/s 7 -o level.json          a level that Kinetix open
 levelproof export data/128k/s --format kinetix -o k    a dataset that Kinetix' reader opens
 levelproof export data/128k/s --format kinetix -o k --where "steps_to_goal < 64"
 levelproof export data/128k/s --format minari -o m     a dataset for offline RL
-levelproof export data/128k/s --format parquet -o t    a table of levels and manifest"""
+levelproof export data/128k/s --format parquet -o t    a table of levels and manifest
+levelproof export data/128k/s --format seed -o s.parquet    some 24 bytes per solved level"""
 JSON = "json"  # for one level; the other formats take a split
 WHERE = (
     "only levels that meet this condition on the manifest's columns "
-    "(default: label = 'solved'; for parquet, all levels)"
+    "(default: label = 'solved'; for parquet and seed, all levels)"
 )
 
 
@@ -33,6 +34,12 @@ def _parquet(split: Path, where: str | None, out: Path) -> None:
     export_parquet(split, where, out)
 
 
+def _seed(split: Path, where: str | None, out: Path) -> None:
+    from levelproof.pipeline.exchange.seed import export_seed
+
+    export_seed(split, where, out)
+
+
 def _minari(split: Path, where: str | None, out: Path, actions: str = "multi_discrete") -> None:
     from levelproof.pipeline.exchange.minari.episodes import ActionKind
     from levelproof.pipeline.exchange.minari.export import export_minari
@@ -40,8 +47,8 @@ def _minari(split: Path, where: str | None, out: Path, actions: str = "multi_dis
     export_minari(split, where, out, ActionKind(actions))
 
 
-# Write the levels of a split that meet a condition (None: the format's default) to a new folder
-FORMATS: dict[str, Callable[..., None]] = {"kinetix": _kinetix, "minari": _minari, "parquet": _parquet}
+# Write the levels of a split that meet a condition (None: the format's default) to a new folder or file
+FORMATS: dict[str, Callable[..., None]] = {"kinetix": _kinetix, "minari": _minari, "parquet": _parquet, "seed": _seed}
 ACTIONS = ("multi_discrete", "combined", "continuous")  # values of ActionKind, whose module is slow to import
 
 

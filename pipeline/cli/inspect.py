@@ -36,13 +36,13 @@ def run(arguments: argparse.Namespace) -> None:
     from levelproof.pipeline.look.query import RowQuery, write_csv
 
     columns = [name.strip() for name in arguments.columns.split(",")] if arguments.columns else None
-    asked = RowQuery(arguments.where, columns, arguments.sort, arguments.limit)
+    query = RowQuery(arguments.where, columns, arguments.sort, arguments.limit)
     if arguments.csv:
-        return write_csv(arguments.split, asked, sys.stdout)
+        return write_csv(arguments.split, query, sys.stdout)
     if arguments.plot:
         from levelproof.pipeline.look.plot import plot
 
-        return plot(arguments.split, asked, arguments.plot)
+        return plot(arguments.split, query, arguments.plot)
     from levelproof.pipeline.look.inspect import inspect
 
-    return inspect(arguments.split, asked, arguments.json, arguments.against)
+    return inspect(arguments.split, query, arguments.json, arguments.against)

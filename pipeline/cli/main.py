@@ -18,10 +18,11 @@ from levelproof.pipeline.urls import require_here, require_known
 from levelproof.pipeline.version import __version__
 
 NAMES = (
-    "generate regenerate settings sample inspect columns plan diff show gallery play clone evaluate export import_ "
-    "card status verify seal"
+    "generate regenerate settings sample inspect columns plan diff show gallery play clone train evaluate export grow "
+    "import_ card status verify seal"
 )
 OUTPUTS = ("out", "plot")  # arguments whose paths must be on this machine
+BUILTIN = "builtin:"  # before the name of a policy that comes with levelproof; experts.networks.saved imports JAX
 COMMANDS = [import_module(f"levelproof.pipeline.cli.{name}") for name in NAMES.split()]
 
 
@@ -34,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str] | None) -> int:
     arguments, unknown = _parser().parse_known_args(argv)
     if hasattr(arguments, "words") and not any(word.startswith("-") for word in unknown):
-        arguments.words, unknown = [*arguments.words, *unknown], []  # words after an option, which argparse leaves over
+        arguments.words, unknown = [*arguments.words, *unknown], []  # argparse leaves over the words after an option
     warnings.showwarning = lambda message, *_: print(f"Warning: {message}", file=sys.stderr)
     try:
         if unknown:
@@ -69,7 +70,7 @@ def _check_paths(arguments: argparse.Namespace) -> None:
     """Raise UserError for a path that is a URL of an unsupported kind, or that must be local."""
     for name, value in vars(arguments).items():
         for path in value if isinstance(value, list) else [value]:
-            if isinstance(path, Path):
+            if isinstance(path, Path) and not (name == "policy" and str(path).startswith(BUILTIN)):
                 (require_here if name in OUTPUTS else require_known)(path)
 
 

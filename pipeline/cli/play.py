@@ -6,7 +6,8 @@ from pathlib import Path
 SUMMARY = "play, edit and solve a level by hand, in a browser"
 EXAMPLE = """levelproof play data/128k/s 7
 levelproof play level.json
-levelproof play --size l"""
+levelproof play --size l
+levelproof play data/128k/s 7 --policy policy/"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -15,6 +16,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("level_id", type=int, nargs="?", metavar="LEVEL_ID", help="id of a level of the split")
     parser.add_argument("--size", default="m", help="size of an empty level (default: m)")
     parser.add_argument("--budget", default="256k", help="env steps of an expert (default: 256k)")
+    policy = "folder of a policy that the page lets play (default: builtin:s, which comes with levelproof)"
+    parser.add_argument("--policy", type=Path, default=Path("builtin:s"), metavar="POLICY", help=policy)
     parser.add_argument("--port", type=int, default=8777, help="port to listen on; 0: any (default: 8777)")
     parser.add_argument("--no-browser", action="store_true", help="do not open the page")
 
@@ -29,4 +32,5 @@ def run(arguments: argparse.Namespace) -> None:
         arguments.budget,
         arguments.port,
         not arguments.no_browser,
+        arguments.policy,
     )

@@ -39,10 +39,11 @@ from levelproof.pipeline.runtime import own_cores
 from levelproof.pipeline.store.columns import schema_of
 from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.manifest import require_manifest
-from levelproof.pipeline.store.shard import open_shard
+from levelproof.pipeline.store.named import open_shard
+from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.words import many
 
-ALWAYS_COLUMNS = ("content_hash", "label", "steps_to_goal", *COLUMNS)
+ALWAYS_COLUMNS = ("label", "steps_to_goal", *COLUMNS)
 OPEN_SHARDS = 256  # shards whose indices are cached
 ALWAYS_FIELDS = ("record/action", "record/reward", "record/done", "record/goal")
 
@@ -56,7 +57,8 @@ def open(
     goal. Reads the manifest now, trajectories on demand.
 
     Args:
-        path: path of the split, such as `data/1M/s`, or its URL (docs/remote.md).
+        path: path of the split, such as `data/1M/s`, or its URL (docs/remote.md); or of a seed file or a folder of
+            some (docs/seeds.md).
         where: SQL condition on the manifest's columns that selects trajectories, such as `label = 'solved' AND
             steps_to_goal < 64`; None: all.
         columns: manifest columns to include in `Dataset.manifest`, besides those that are always read.
@@ -86,7 +88,9 @@ class Dataset:
 
     def __init__(self, split: Path, where: str | None, columns: Sequence[str], validation: float) -> None:
         self.split, self._opened_with = split, (split, where, columns, validation)
-        manifest = require_manifest(split, [*ALWAYS_COLUMNS, *columns, *columns_in(where)], compact=True)
+        hashed = [] if is_seed(split) else ["content_hash"]  # of seeds on demand: it takes their levels
+        columns = [*hashed, *ALWAYS_COLUMNS, *columns, *columns_in(where)]
+        manifest = require_manifest(split, columns, compact=True)
         rows = select(manifest.table.filter(pc.is_valid(manifest.table["shard"])), where)  # pyright: ignore[reportAttributeAccessIssue]
         if not rows.num_rows:
             what = "has no trajectories yet" if where is None else f"has no trajectories for which {where}"
@@ -101,6 +105,14 @@ class Dataset:
     def manifest(self) -> pa.Table:
         """Manifest rows of the trajectories, a table with one row per index (docs/columns.md)."""
         return self._manifest
+
+    @cached_property
+    def content_hashes(self) -> list[str]:
+        """Content hashes of the trajectories' levels; of seeds, made from the levels at the first call."""
+        table = self._manifest
+        if "content_hash" not in table.column_names:
+            table = require_manifest(self.split, ["content_hash"], table["level_id"].to_numpy()).table
+        return table["content_hash"].to_pylist()
 
     @cached_property
     def size(self) -> Size:
@@ -297,8 +309,9 @@ class Dataset:
         return f"levelproof.open({', '.join(map(repr, self._opened_with))}) of {many(len(self), 'trajectory')}"
 
     def _subset(self, subset: str | None) -> Int[np.ndarray, " index"]:
-        share = self._opened_with[-1]
-        indices = np.flatnonzero(in_subset(self._manifest["content_hash"].to_pylist(), subset, share))
+        if subset is None:
+            return np.arange(len(self))
+        indices = np.flatnonzero(in_subset(self.content_hashes, subset, self._opened_with[-1]))
         if not len(indices):
             raise UserError(
                 f"None of the {len(self)} trajectories is in the subset {subset}: pass another validation= to open."
@@ -306,7 +319,7 @@ class Dataset:
         return indices
 
     def _arrays(self, indices: Int[np.ndarray, " batch"], fields: Sequence[str]) -> dict[str, np.ndarray]:
-        """Gather arrays of trajectories by field name, level axis first; follow levels that a seal has current."""
+        """Gather arrays of trajectories by field name, level axis first; follow levels that a seal moved."""
         if not indices.size or indices.min() < 0 or indices.max() >= len(self):
             raise UserError(f"There are no trajectories {indices.tolist()}: use indices from 0 to {len(self) - 1}.")
         while True:

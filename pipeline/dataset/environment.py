@@ -7,9 +7,12 @@ from pathlib import Path
 import jax
 
 from levelproof.levelgen.level import Level
+from levelproof.levelgen.sampling.distribution import Distribution
+from levelproof.levelgen.sampling.sampler import Sampler, sampler
 from levelproof.levelgen.task import environment
 from levelproof.levelgen.task.environment import ActionType, Environment, EnvParams, ObservationType
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
+from levelproof.physics.types import Size
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.read.levels import COLUMNS, levels_of, rules_of
 from levelproof.pipeline.read.select import columns_in, select
@@ -17,7 +20,7 @@ from levelproof.pipeline.store.manifest import require_manifest
 
 
 def make(
-    levels: Level | None = None,
+    levels: Level | Sampler | Size | str | None = None,
     action_type: str = ActionType.MULTI_DISCRETE,
     observation_type: str = ObservationType.SYMBOLIC_FLAT,
     rules: TaskParams | None = None,
@@ -26,14 +29,16 @@ def make(
     *,
     split: str | os.PathLike[str] | None = None,
     where: str | None = None,
+    distribution: Distribution | str | None = None,
 ) -> tuple[Environment, EnvParams]:
-    """Make an environment and its default parameters, from levels or from a split.
+    """Make an environment and its default parameters, from a size, from levels or from a split.
 
     The environment has gymnax's functions, such as `env.reset(key, params)` and `env.step(key, state, action, params)`,
     for one environment: batch them with `jax.vmap`.
 
     Args:
-        levels: levels from which resets draw uniformly; level axis last.
+        levels: a size such as "s": every reset samples a new random level, and `level_index` is its id. Or levels from
+            which resets draw uniformly, level axis last.
         action_type: `discrete` (an integer), `multi_discrete` (integers [6]: four motors, two thrusters) or
             `continuous` (floats [6]: motors in [-1, 1], thrusters in [0, 1]).
         observation_type: `symbolic_flat` (float32 [feature]), `symbolic_flat_padded`, `symbolic_entity` or `pixels`
@@ -43,6 +48,7 @@ def make(
         final_observation: whether `info["final_observation"]` has the observation before an automatic reset.
         split: path or URL of a split, such as `data/128k/s`, instead of `levels`: uses all its levels, with or without
             a witness, sorted by id (`env.level_ids`).
+        distribution: of the random levels of a size, or the name of a preset; None: the default.
         where: SQL condition on the manifest's columns that selects levels of the split, such as `label = 'solved' AND
             steps_to_goal < 64`; None: all.
 
@@ -51,19 +57,35 @@ def make(
 
     Raises:
         UserError: neither or both of `levels` and `split` are given, the split does not exist, the condition is
-            invalid, or no level meets it.
+            invalid, no level meets it, or there is no such preset.
         Failure: the split is damaged.
-        ValueError: a type is unknown, there are no levels, or `jax_enable_x64` is on.
+        ValueError: a type or a size is unknown, there are no levels, or `jax_enable_x64` is on.
     """
     if (levels is None) == (split is None):
         raise UserError("make takes either levels or split=, the path of a split: pass one of them.")
-    if split is None or levels is not None:
-        if where is not None:
-            raise UserError("where= is a condition on the levels of a split: pass split= with it, not levels.")
-        assert levels is not None
-        return environment.make(
-            levels, action_type, observation_type, rules or DEFAULT_RULES, auto_reset, final_observation
-        )
+    kinds, resets = (action_type, observation_type), (auto_reset, final_observation)
+    if split is not None:
+        if distribution is not None:
+            raise UserError("distribution= is that of a size's random levels, and a split has its own: leave it out.")
+        return _of_split(split, where, rules, kinds, resets)
+    if where is not None:
+        raise UserError("where= is a condition on the levels of a split: pass split= with it, not levels.")
+    assert levels is not None
+    if isinstance(levels, str | Size):
+        levels = sampler(levels, _distribution(distribution))
+    elif distribution is not None:
+        raise UserError("distribution= is that of a size's random levels: pass a size such as 's' with it.")
+    return environment.make(levels, *kinds, rules or DEFAULT_RULES, *resets)
+
+
+def _of_split(
+    split: str | os.PathLike[str],
+    where: str | None,
+    rules: TaskParams | None,
+    kinds: tuple[str, str],
+    resets: tuple[bool, bool],
+) -> tuple[Environment, EnvParams]:
+    """Make an environment of the levels of a split, with the task's rules there if `rules` are None."""
     manifest = require_manifest(Path(split), ["level_id", *COLUMNS, *columns_in(where)])
     rows = select(manifest.table, where)
     if not rows.num_rows:
@@ -72,12 +94,17 @@ def make(
         )
     # Initialise JAX with the caller's settings, before `levels_of` would limit it to one thread, as for a worker
     jax.devices()
-    env, params = environment.make(
-        levels_of(manifest, rows),
-        action_type,
-        observation_type,
-        rules or rules_of(manifest),
-        auto_reset,
-        final_observation,
-    )
+    env, params = environment.make(levels_of(manifest, rows), *kinds, rules or rules_of(manifest), *resets)
     return replace(env, level_ids=rows["level_id"].to_numpy()), params
+
+
+def _distribution(chosen: Distribution | str | None) -> Distribution:
+    """Return the distribution, that of a preset's name, or the default. Raise UserError if there is no such preset."""
+    if not isinstance(chosen, str):
+        return chosen or Distribution()
+    from levelproof.configs.compose import distributions  # imports Hydra
+
+    known = distributions()
+    if chosen not in known:
+        raise UserError(f"There is no distribution {chosen!r}: choose one of {', '.join(known)}.")
+    return known[chosen]

@@ -6,7 +6,6 @@ Workers write their own shards and fragments; only summaries travel. Knows nothi
 import io
 import logging
 import os
-import signal
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,18 +30,20 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy, Place
 from levelproof.configs.schema import JobConfig
 from levelproof.levelgen.level import size_of
 from levelproof.pipeline.errors import Failure, last_line
+from levelproof.pipeline.jobs.actor import WorkerActor
 from levelproof.pipeline.jobs.address import cannot_start, ray_address, require_reachable
-from levelproof.pipeline.jobs.likeness import Program, mismatch, program_of, with_absolute_paths
+from levelproof.pipeline.jobs.likeness import program_of, with_absolute_paths
 from levelproof.pipeline.jobs.places import bytes_of_worker, memory_to_reserve, shortage, workers_by_machine
 from levelproof.pipeline.jobs.progress import STOPPING, Board, Meters
-from levelproof.pipeline.jobs.schedule import Order, Round, Scheduler, Settle, UnitOutcome, levels_text, until_report
-from levelproof.pipeline.runtime import NO_GPU, jax_sees_a_gpu, own_core, own_cores, prepare_jax
+from levelproof.pipeline.jobs.schedule import Round, Scheduler, Settle, UnitOutcome, levels_text, until_report
+from levelproof.pipeline.runtime import NO_GPU, jax_sees_a_gpu, own_cores
 from levelproof.pipeline.stopping import Stop
-from levelproof.pipeline.store.leases import serve, served
+from levelproof.pipeline.store.leases import served
 from levelproof.pipeline.store.remote import absolute
 from levelproof.pipeline.words import duration
 
 OBJECT_STORE = 80 * 2**20  # bytes; close to Ray's minimum, because only summaries travel
+STARTING = 1.0  # s to start workers before the driver looks at answers and signals again; Ray takes some 10 ms each
 POLL = 0.25  # s between progress updates, whether a worker has reported or not
 RESCAN = 5.0  # s between checks for machines that joined or left the cluster
 GPU_PATIENCE = 10.0  # s to wait for a free GPU before workers use CPU cores
@@ -50,42 +51,6 @@ PROBE_PATIENCE = 120.0  # s to wait for a process that tries a GPU; it imports J
 PATIENCE = 60.0  # s without any worker before the driver says why
 STARTS = 3  # failed starts in a row after which a worker is given up
 MAX_SILENT = 1800.0  # s without a report after which a worker is given up; a large program compiles for minutes
-
-
-class WorkerActor:
-    """A worker in its own process. Calls are short (see `schedule.ROUND`), so one thread suffices."""
-
-    def begin(self, program: Program, job: JobConfig, split: Path, neighbours: int, writer: str) -> str:
-        """Set the worker up (see `own_core`, `leases.serve`); return why not if the driver has another program."""
-        if refusal := mismatch(program, job):
-            return refusal
-        prepare_jax(own_core(neighbours), job.device)
-        from levelproof.pipeline.jobs.worker import Worker  # its imports read JAX's settings, so they come after them
-
-        serve(split, writer)
-        self._worker, self._working, self._rounds = Worker(job, split), False, 0
-        self._previous_handler = signal.signal(signal.SIGTERM, self._on_sigterm)
-        return ""
-
-    def work(self, order: Order, seconds: float) -> Round:
-        """Work one round, which ends early if the driver cancels it: no other call reaches a busy worker."""
-        self._working = True
-        try:
-            self._latest = self._worker.work(order, seconds, ray.get_runtime_context().is_canceled)
-            self._rounds += 1
-            return self._latest
-        finally:
-            self._working = False
-
-    def leave(self, heard: int) -> list[Round]:
-        """Commit decided levels and leave; return the last round, after the one before if the driver `heard` fewer."""
-        return [*([self._latest] if self._rounds > heard else []), self._worker.leave()]
-
-    def _on_sigterm(self, number: int, frame: Any) -> None:
-        """Leave after the current step if the worker is in a round, else at once."""
-        self._worker.stopping = True
-        if not self._working and callable(self._previous_handler):
-            self._previous_handler(number, frame)
 
 
 @dataclass(eq=False)
@@ -96,7 +61,7 @@ class WorkerHandle:
     host: str
     memory: int = 0  # bytes that Ray reserves for it
     actor: Any = None
-    answer: Any = None  # reference to the pending result of `begin`, then of `work`
+    answer: Any = None  # reference to the pending result of `begin`, of `compile_next`, then of `work`
     up: bool = False  # `begin` has succeeded
     heard: int = 0  # rounds that have reached the driver
     out_of_reach: bool = False  # Ray could not reach it; `answer` now waits until it can
@@ -117,7 +82,7 @@ class WorkerHandle:
         here = NodeAffinitySchedulingStrategy(self.node, soft=False)
         resources = {"num_cpus": 1, "num_gpus": gpus, "memory": self.memory}
         options = {"max_restarts": 0, "scheduling_strategy": here, **resources}
-        self.actor = ray.remote(WorkerActor).options(name=f"{name} on {self.host}", **options).remote()
+        self.actor = ray.remote(WorkerActor).options(name=f"{name} on {self.host}", **options).remote(is_canceled)
         self.answer = self.actor.begin.remote(*begin)
 
     def end(self) -> None:
@@ -202,10 +167,13 @@ class Crew:
         del self._handles[self._most :]
 
     def start_workers(self) -> None:
-        """Start missing workers, while more levels wait than workers are starting."""
+        """Start missing workers for about STARTING seconds, while more levels wait than workers are starting."""
+        end = time.monotonic() + STARTING
         starting = sum(handle.starting for handle in self._handles)
         without = [handle for handle in self._handles if handle.actor is None]
         for handle in without[: max(0, self._scheduler.waiting - starting)]:
+            if time.monotonic() > end:
+                break
             self._started += 1
             name = f"levelproof {self._job.budget}/{self._job.size} worker {self._started}"
             neighbours = 0 if self._gpus else sum(other.node == handle.node for other in self._handles)
@@ -270,6 +238,10 @@ class Crew:
         if handle.out_of_reach:
             return self._lose(handle, "The worker was out of reach", "The worker was out of reach")
         if not handle.up:
+            if isinstance(answer, tuple):
+                self._board.tally.compiled, self._notice_at = answer, time.monotonic() + PATIENCE
+                handle.answer = handle.actor.compile_next.remote()
+                return []
             if answer:
                 self._refuse(handle, answer)
                 return []
@@ -392,6 +364,11 @@ def _why_no_gpu() -> str:
         return f"the cluster has one, but no answer came from it ({last_line(error)})"
     finally:
         remove_placement_group(group)
+
+
+def is_canceled() -> bool:
+    """Whether the driver has cancelled the call that this worker executes."""
+    return ray.get_runtime_context().is_canceled()
 
 
 def _machines() -> dict[str, dict[str, Any]]:

@@ -22,7 +22,7 @@ class Events:
     def __init__(
         self, tally: Tally, scheduler: Scheduler, command: str, publish: Callable[[Sequence[Event]], None]
     ) -> None:
-        """`publish` replaces the events that it published before."""
+        """Each call of `publish` receives all events to keep, and replaces those of the last call."""
         self._tally, self._scheduler, self._publish = tally, scheduler, publish
         self._began = _event("started", command=command, levels=tally.levels, done=tally.done, solved=tally.solved)
         self._latest: deque[Event] = deque(maxlen=MAX_EVENTS)

@@ -16,6 +16,7 @@ from levelproof.configs.schema import JobConfig
 from levelproof.experts.labels import Label
 from levelproof.experts.steps import EnvSteps
 from levelproof.pipeline.errors import Exit, Failure, UserError
+from levelproof.pipeline.jobs.choice import runs_here
 from levelproof.pipeline.jobs.events import Events, recording
 from levelproof.pipeline.jobs.log import logged, require_library
 from levelproof.pipeline.jobs.progress import Board, Tally, say
@@ -105,6 +106,10 @@ def generate_from_files(job: JobConfig, command: Sequence[str], console: Console
         say(console, sentence)
     if not listing.levels:
         raise UserError(f"None of the level files in {folder} can be used, for the reasons above: fix one of them.")
+    # One choice for all sizes, because Ray forks this process, which must not have started JAX before
+    count = sum(map(len, listing.levels.values()))
+    here = all(runs_here(replace(job, size=size), count) for size in listing.levels)
+    job = replace(job, executor="inline" if here else "ray")
     exits = [
         generate(replace(job, size=size), command, console, origins=origins) for size, origins in listing.levels.items()
     ]
@@ -136,7 +141,7 @@ def _make(
     tally = Tally(len(wanted), there, manifest.counts(is_done).get(Label.SOLVED, 0))
     board = Board(tally, console)
     already = f", {there} are there already" if there else ""
-    board.say(f"{count} of size {job.size}, {job.budget} env steps each, into {as_typed(split)}{already}")
+    board.say(f"{count} of size {job.size}, {job.origin}, into {as_typed(split)}{already}")
     try:
         with (
             logged(job, split, board.say) as log,
@@ -186,7 +191,7 @@ def _work(
         if outcomes:
             sealer.advance(scheduler.first)
 
-    if job.executor == "inline":
+    if runs_here(job, board.tally.levels - board.tally.done):
         from levelproof.pipeline.jobs.inline import run
     else:
         from levelproof.pipeline.jobs.cluster import run
@@ -203,6 +208,7 @@ def _spent(manifest: Manifest, made: np.ndarray, spent: EnvSteps) -> str:
         "of training that did not": steps[label == Label.UNSOLVED].sum(),
         "of evaluations": spent.evaluated,
         "in empty slots": spent.idle,
+        "of replayed witnesses": spent.replayed,
     }
     parts = ", ".join(f"{share / sum(spent):.0%} {name}" for name, share in shares.items() if share)
     return f"{sum(spent):,} env steps: {parts}."

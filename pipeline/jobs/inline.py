@@ -1,15 +1,23 @@
-"""The executor without Ray: one worker in this process, for debugging."""
+"""The executor without Ray: one worker in this process."""
 
 import time
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from levelproof.configs.schema import JobConfig
 from levelproof.pipeline.jobs.progress import STOPPING, Board
 from levelproof.pipeline.jobs.schedule import ROUND, Scheduler, Settle
-from levelproof.pipeline.runtime import NO_GPU, jax_sees_a_gpu, prepare_jax
+from levelproof.pipeline.runtime import NO_GPU, jax_sees_a_gpu, own_cores, prepare_jax
 from levelproof.pipeline.stopping import Stop
 
+if TYPE_CHECKING:
+    from levelproof.pipeline.jobs.ahead import Ahead
+
 HERE = "this process"
+POLL = 0.25  # s between progress updates while programs compile
+MAX_THREADS = 6  # of compiling; one at a time traces, which takes a fifth of the time
+MANY = 16  # levels that use nearly all programs of a job, so that none compiles in vain
 
 
 def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board: Board, stop: Stop) -> None:
@@ -17,10 +25,16 @@ def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board
     prepare_jax(device=job.device)
     if job.device == "gpu" and not jax_sees_a_gpu():
         board.say(f"This process uses a CPU core, not a GPU: {NO_GPU}.")
-    from levelproof.pipeline.jobs.worker import Worker  # its imports read JAX's settings, so they come after them
+    from levelproof.pipeline.jobs.ahead import Ahead  # their imports read JAX's settings, so they come after them
+    from levelproof.pipeline.jobs.workers import worker_for
 
     with stop.heeded():
-        worker = Worker(job, split)
+        worker = worker_for(job, split)
+        threads = min(len(own_cores()), MAX_THREADS)
+        if worker.pool and job.device == "cpu" and threads > 1 and scheduler.waiting >= MANY:
+            worker.compiling = _compile_side_by_side(Ahead(job, worker.pool), threads, board, stop)
+            if stop.asked.is_set():
+                return  # no level has begun
         scheduler.join(HERE, time.monotonic())
         while not scheduler.over:
             if stop.asked.is_set():
@@ -28,9 +42,27 @@ def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board
                 worker.stopping = True
             order = scheduler.order(HERE, time.monotonic())
             board.refresh()
-            round = worker.work(order, ROUND)
+            round = worker.work(order, ROUND, stop.asked.is_set)
             scheduler.report(HERE, round, time.monotonic())
             board.tally.follow(round)
             settle(round.outcomes)
             if round.leaves:
                 raise KeyboardInterrupt
+
+
+def _compile_side_by_side(ahead: "Ahead", threads: int, board: Board, stop: Stop) -> float:
+    """Compile the programs that the cache lacks, in threads; return the seconds of all threads."""
+
+    def compile_some() -> None:
+        while not stop.asked.is_set() and ahead.compile_next():
+            pass
+
+    with ThreadPoolExecutor(threads) as pool:
+        running = {pool.submit(compile_some) for _ in range(threads if ahead.left else 0)}
+        while running:
+            done, running = wait(running, POLL)
+            board.tally.compiled = ahead.compiled
+            board.refresh()
+            for thread in done:
+                thread.result()
+    return ahead.compiling

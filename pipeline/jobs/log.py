@@ -49,8 +49,6 @@ def logged(job: JobConfig, split: Path, say: Callable[[str], None]) -> Iterator[
     def opened() -> ScalarWriter:
         # Object stores cannot append to files
         folder = Path(FOLDER, *split.parts[-2:]) if is_remote(split) else split / FOLDER
-        if not is_remote(split) and folder.is_symlink():
-            raise UserError(f"{folder} is a link, but a split's folders must lie inside it")
         return writer_of(job.log, folder, "levels/committed", f"{job.budget}/{job.size}", job.results)
 
     def take(events: Sequence[Event]) -> None:
@@ -97,7 +95,13 @@ class GuardedLog:
 
 
 def writer_of(log: str, folder: Path, step: str, name: str, settings: Mapping[str, Any]) -> ScalarWriter:
-    """Open the writer that `log` names: `step` is the scalar to plot over, `name` and `settings` describe the run."""
+    """Open the writer that `log` names: `step` is the scalar to plot over, `name` and `settings` describe the run.
+
+    Raises:
+        UserError: a link has the name of the folder.
+    """
+    if folder.is_symlink():
+        raise UserError(f"{folder} is a link, but must be a folder")
     return TensorBoardWriter(folder, step) if log == "tensorboard" else WandbWriter(folder, step, name, settings)
 
 

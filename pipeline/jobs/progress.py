@@ -30,6 +30,7 @@ class Tally:
     running: dict[WorkUnit, tuple[int, float, int]] = field(default_factory=dict)  # env steps, levels, solved
     spent: EnvSteps = field(default_factory=EnvSteps)  # on this run's committed units
     seconds: Seconds = NO_SECONDS  # of workers, on the same units
+    compiled: tuple[int, int] = (0, 0)  # programs that workers have compiled before they begin, and all of them
 
     def follow(self, round: Round) -> None:
         """Account for a worker's round. The caller passes units that ended to `ended` itself."""
@@ -71,11 +72,12 @@ class Tally:
 
     def text(self, rate: float, left: float | None) -> str:
         """Describe the progress, at `rate` env steps/s and with `left` s to go (None: not known yet)."""
-        pace = f"{rate:,.0f} env steps/s"
+        pace, (compiled, programs) = f"{rate:,.0f} env steps/s", self.compiled
         if self.trained == self.levels:
             tail = "done" if self.done == self.levels else "writing"
         elif left is None:
-            tail = f"{pace} · {'...' if rate else 'compiling'}"
+            of_them = f", {compiled} of {programs} programs" if compiled < programs else ""
+            tail = f"{pace} · {'...' if rate else f'compiling{of_them}'}"
         else:
             tail = f"{pace} · about {duration(left)} left"
         return f"{self.trained}/{self.levels} levels · {self.solved_so_far} solved · {tail}"

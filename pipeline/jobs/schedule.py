@@ -192,7 +192,7 @@ class Scheduler:
 
     @property
     def first(self) -> int | None:
-        """The lowest level id of the units whose first attempt has not ended; None: there is none."""
+        """Lowest level id among units whose first attempt has not ended; None: all have."""
         running = (unit for mine in self.workers.values() for unit in mine.units if unit not in self.attempts)
         units = chain(running, self._returned[0], [self._next] if self._next else [])
         return min((unit.level_ids[0] for unit in units), default=None)
@@ -274,7 +274,8 @@ class Scheduler:
     def _take(self, mine: Assignment) -> WorkUnit | None:
         """Return the next unit for a worker.
 
-        None if it wants none, if it has some while others are idle, or if no waiting unit may join those that it has.
+        None if the worker wants none, if it has units while other workers are idle, or if no waiting unit may run
+        beside its units.
         """
         if mine.units and (mine.wants <= 0 or self._idle):
             return None
@@ -320,7 +321,7 @@ class Scheduler:
 
 
 def until_report(order: Order, workers: int) -> float:
-    """Return the seconds after which a worker reports, one of `workers`, if none of its units ends before."""
+    """Return the seconds after which one of `workers` workers reports even if none of its units has ended."""
     return ROUND if order.give else max(ROUND, workers / REPORTS)
 
 

@@ -23,6 +23,7 @@ from levelproof.pipeline.store.job_note import note_density
 from levelproof.pipeline.store.layout import fragment_path, unit_name
 from levelproof.pipeline.store.manifest import Fragment, require_manifest, write_index
 from levelproof.pipeline.store.remote import as_typed
+from levelproof.pipeline.store.scratch import written_disk
 from levelproof.pipeline.store.seal import Piece, seal
 from levelproof.pipeline.store.split import taken
 from levelproof.pipeline.words import many
@@ -138,7 +139,7 @@ class Sealer:
         self._thread.shutdown()
 
     def _seal(self, group: list[Piece]) -> Piece:
-        with explaining_writes(self._split):
+        with explaining_writes(written_disk(self._split)):
             return seal(self._split, group, self._check_stop)
 
     def _check_stop(self, _: int) -> None:

@@ -9,7 +9,6 @@ import traceback
 from collections.abc import Collection
 from dataclasses import asdict, replace
 from pathlib import Path
-from tempfile import gettempdir
 from typing import Any
 
 import numpy as np
@@ -28,6 +27,7 @@ from levelproof.levelgen.identity.signature import signatures
 from levelproof.levelgen.level import Level, size_of
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import TaskParams
+from levelproof.physics.step import ENGINE_VERSION
 from levelproof.pipeline.errors import Failure, StoreFailure
 from levelproof.pipeline.jobs.schedule import Summary, UnitOutcome, WorkUnit
 from levelproof.pipeline.read.level_files import LevelUnavailable, levels_at
@@ -43,7 +43,7 @@ from levelproof.pipeline.store.origins import RECORD, Origin
 from levelproof.pipeline.store.paused import CheckpointUnread, drop_paused, load_paused
 from levelproof.pipeline.store.provenance import device, versions
 from levelproof.pipeline.store.publish import committed_levels
-from levelproof.pipeline.store.remote import is_remote
+from levelproof.pipeline.store.scratch import written_disk
 from levelproof.pipeline.store.shard import write_shard
 
 
@@ -89,7 +89,7 @@ def failure(split: Path, unit: WorkUnit, error: Exception) -> UnitOutcome:
     reason, fatal = "".join(traceback.format_exception(error)), ""
     if isinstance(error, (LockRefused, SourceUnseen, LevelUnavailable, LeaseLost, StoreFailure, CheckpointUnread)):
         fatal = str(error)
-    elif isinstance(error, OSError) and (sentence := refusal(error, Path(gettempdir()) if is_remote(split) else split)):
+    elif isinstance(error, OSError) and (sentence := refusal(error, written_disk(split))):
         fatal = f"{sentence}."
     return UnitOutcome(unit, reason=reason, fatal=fatal)
 
@@ -206,6 +206,7 @@ def manifest_row(job: JobConfig, level_id: int, verdict: Verdict) -> dict[str, A
         "experts": None,
         "config_hash": job.hash,
         "versions": versions(),
+        "engine": ENGINE_VERSION,
         "device": device(),
         "seconds": None,
         "command": f"{shortest_command(job)} first_level={level_id} levels=1",

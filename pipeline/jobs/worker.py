@@ -9,6 +9,7 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from levelproof.configs.schema import JobConfig
+from levelproof.experts.ledger import Lap
 from levelproof.experts.pool.run import TrainingRun
 from levelproof.pipeline.errors import LevelproofError
 from levelproof.pipeline.jobs.schedule import Cut, Order, Round, UnitOutcome, WorkUnit
@@ -21,9 +22,10 @@ class Worker:
 
     def __init__(self, job: JobConfig, split: Path) -> None:
         self._job, self._split = job, split
-        self._pool = pool_for(job)
+        self.pool = pool_for(job)
         self._runs: dict[WorkUnit, TrainingRun] = {}
         self._keep_at = time.monotonic() + job.checkpoint_seconds
+        self.compiling = 0.0  # s of compiling before any unit came, charged to the first one
         self.stopping = False  # set by the executor to make the worker leave after the current step
 
     def work(self, order: Order, seconds: float, ended: Callable[[], bool] = lambda: False) -> Round:
@@ -44,7 +46,7 @@ class Worker:
         now = {unit: run.totals() for unit, run in self._runs.items()}
         # Plain tuples, because the driver imports no JAX
         plain = {unit: (run.env_steps, run.levels, run.solved) for unit, run in now.items()}
-        wants = self._pool.wants(sum(run.searching for run in self._runs.values()))
+        wants = self.pool.wants(sum(run.searching for run in self._runs.values()))
         return Round(outcomes, plain, wants, sum(len(run.unbegun) for run in self._runs.values()), cuts)
 
     def leave(self, outcomes: Sequence[UnitOutcome] = (), cuts: Sequence[Cut] = ()) -> Round:
@@ -61,7 +63,7 @@ class Worker:
         A save that fails is retried at the next interval.
         """
         self._keep_at = time.monotonic() + self._job.checkpoint_seconds
-        in_slots = list(self._pool.paused())
+        in_slots = list(self.pool.paused())
         for unit, run in self._runs.items():
             if paused := run.paused(in_slots):
                 with contextlib.suppress(OSError, LevelproofError):
@@ -87,7 +89,9 @@ class Worker:
 
     def _begin(self, unit: WorkUnit) -> UnitOutcome | None:
         try:
-            self._runs[unit] = begin_unit(self._job, self._split, unit, self._pool)
+            self._runs[unit] = run = begin_unit(self._job, self._split, unit, self.pool)
+            run.ledger.add("sampling", Lap(compiling=self.compiling))
+            self.compiling = 0.0
         except Exception as error:
             return failure(self._split, unit, error)
         return None
@@ -95,12 +99,12 @@ class Worker:
     def _step(self) -> list[UnitOutcome]:
         """Advance the pool by one step; return the outcomes of the units that finished."""
         try:
-            finished = self._pool.step()
+            finished = self.pool.step()
             for run in self._runs.values():
                 run.submit_searched()
         except Exception as error:
             units = list(self._runs)
-            self._runs, self._pool = {}, pool_for(self._job)
+            self._runs, self.pool = {}, pool_for(self._job)
             return [failure(self._split, unit, error) for unit in units]
         ended = [unit for unit, run in self._runs.items() if run.submission in finished]
         return [self._finish(unit) for unit in ended]

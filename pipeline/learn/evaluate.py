@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -22,39 +22,49 @@ from levelproof.experts.evaluation import (
     play_sampled,
     play_sticky,
 )
-from levelproof.experts.networks.saved import Policy, PolicyError, load_policy
-from levelproof.levelgen.level import name_of
+from levelproof.experts.networks.saved import Policy
+from levelproof.levelgen.level import SIZES, name_of
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs.progress import say
-from levelproof.pipeline.learn.measured import MeasuredLevels, levels_in, sealed_levels
+from levelproof.pipeline.learn.looks import LOOKS, log_look
+from levelproof.pipeline.learn.measured import MeasuredLevels, is_split, levels_in, midway_levels, sealed_levels
+from levelproof.pipeline.learn.published import PROTOCOLS, published_levels
 from levelproof.pipeline.learn.solve_rates import Solved, solve_rates
+from levelproof.pipeline.learn.specialists import Specialists, sealed_specialists, specialists_of
+from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.words import many
 
+SEALED = "sealed"
+ATTEMPTS = 8
 NOTHING = "doing nothing"
 ALL, NOT_TRIVIAL, SOLVED = "all", "that doing nothing does not solve", "labelled solved"  # denominators
 
 
 def evaluate(
     policy: Path | None,
-    place: Path | None,
+    on: str,
     where: str | None,
-    sizes: Sequence[str],
+    sizes: Sequence[str] | None,
     count: int | None,
-    attempts: int,
+    attempts: int | None,
     seed: int,
+    starts: Sequence[float],
+    experts: Sequence[Path],
     as_json: bool,
 ) -> None:
     """Play levels, and print a table of solve rates or JSON.
 
     Args:
         policy: folder of a policy; None: baselines only.
-        place: split, or folder of level files; None: the sealed levels.
+        on: SEALED, a name in PROTOCOLS, a split, or a folder of level files.
         where: SQL condition that selects levels of a split.
-        sizes: sizes of the sealed levels.
+        sizes: sizes of the sealed or published levels; None: s of the sealed, all of the published.
         count: number of levels, the first ones; None: all.
-        attempts: attempts at each level.
+        attempts: attempts at each level; None: as many as published rates come from, else ATTEMPTS.
         seed: of the attempts.
+        starts: where in the witnesses of a split attempts start, as shares of the steps to the goal, 0 to below 1.
+        experts: splits whose own experts of the levels stand in the table, too.
         as_json: whether to print JSON instead of tables.
 
     Raises:
@@ -62,15 +72,20 @@ def evaluate(
         Failure: the split is damaged.
     """
     prepare_jax()
-    loaded = _loaded(policy) if policy else None
+    loaded = policy_at(policy) if policy else None
     entrants = _entrants(loaded)
     console = Console(stderr=True)
-    sealed = (sealed_levels(size, count) for size in dict.fromkeys(sizes))
-    groups = levels_in(place, where, count, partial(say, console)) if place else sealed
     facts = []
-    for group in groups:
-        _require_size(loaded, group)
-        facts.append(_measured(group, entrants, attempts, seed, console))
+    if attempts is None:
+        attempts = PROTOCOLS[on].attempts if on in PROTOCOLS else ATTEMPTS
+    for group in _groups(on, where, sizes, count, starts, partial(say, console)):
+        if loaded:
+            require_size(loaded, group.levels.size, group.name, "choose others with --on or --size")
+        own = sealed_specialists(name_of(group.levels.size), len(group.level_ids), attempts) if on == SEALED else []
+        own += [specialists_of(split, group.level_ids, attempts) for split in experts]
+        facts.append(_measured(group, entrants, own, attempts, seed, console))
+    if policy and on == SEALED and (looks := log_look(policy, facts, attempts, seed)):
+        say(console, f"Look {looks} at the sealed levels; {policy / LOOKS} lists all of this policy.")
     if as_json:
         json.dump({"policy": policy and str(policy), "attempts": attempts, "seed": seed, "levels": facts}, sys.stdout)
         print()
@@ -78,6 +93,38 @@ def evaluate(
     for group in facts:
         _print(group, attempts, Console(highlight=False, markup=False))
     print("In brackets: 95% intervals over levels.")
+    if any(group["published"] for group in facts):
+        print("sfl-paper, sfl-1m-envs: the reference's agents, as it published.")
+
+
+def is_named(on: str) -> bool:
+    """Whether this is the name of a set of levels, not a path."""
+    return on == SEALED or on in PROTOCOLS
+
+
+def _groups(
+    on: str,
+    where: str | None,
+    sizes: Sequence[str] | None,
+    count: int | None,
+    starts: Sequence[float],
+    tell: Callable[[str], None],
+) -> Iterator[MeasuredLevels]:
+    """Yield the levels to play. Arguments and errors as `evaluate`."""
+    if any(starts):
+        if is_named(on) or not is_split(Path(on)):
+            raise UserError(
+                f"--start plays from states of a split's witnesses, and {on} is no split: name one with --on."
+            )
+        for start in starts:
+            yield midway_levels(Path(on), where, count, start)
+    elif on == SEALED:
+        for size in dict.fromkeys(sizes or ["s"]):
+            yield sealed_levels(size, count)
+    elif on in PROTOCOLS:
+        yield from published_levels(on, [*dict.fromkeys(sizes or SIZES)], count, tell)
+    else:
+        yield from levels_in(Path(on), where, count, tell)
 
 
 class _Entrant(NamedTuple):
@@ -99,38 +146,34 @@ def _entrants(policy: Policy | None) -> dict[str, _Entrant]:
     return entrants
 
 
-def _loaded(folder: Path) -> Policy:
-    try:
-        return load_policy(folder)
-    except PolicyError as error:
-        raise UserError(str(error)) from None
-
-
-def _require_size(policy: Policy | None, group: MeasuredLevels) -> None:
-    if policy and policy.size not in (None, group.levels.size):
-        raise UserError(
-            f"The policy plays levels of size {name_of(policy.size)} only, and those of {group.name} have "
-            f"{name_of(group.levels.size)}: choose others with --on or --size."
-        )
-
-
 def _measured(
-    group: MeasuredLevels, entrants: dict[str, _Entrant], attempts: int, seed: int, console: Console
+    group: MeasuredLevels,
+    entrants: dict[str, _Entrant],
+    experts: Sequence[Specialists],
+    attempts: int,
+    seed: int,
+    console: Console,
 ) -> dict[str, Any]:
     """Play one group of levels; return its facts as JSON types."""
-    solved: dict[str, Solved] = {}
+    solved, steps = dict[str, Solved](), dict[str, Any]()
     with _shown(console, group.name, len(group.level_ids) * len(entrants)) as follow:
         for name, (player, params, chance) in entrants.items():
             tries = attempts if chance else 1
             played = play(player, params, group.levels, group.level_ids, tries, seed, group.rules, follow)
-            solved[name] = played.solved
+            solved[name], steps[name] = played
+    solved |= dict(experts)
     chosen = {ALL: np.ones(len(group.level_ids), bool), NOT_TRIVIAL: ~solved[NOTHING][:, 0]}
     if group.solved is not None:
         chosen[SOLVED] = group.solved
     return {
         "levels": group.name,
+        "start": group.start,
+        "published": dict(group.published),
         "of": {
-            title: {name: solve_rates(each[some]) for name, each in solved.items()}
+            title: {
+                name: solve_rates(each[some], steps[name][some] if name in steps else None)
+                for name, each in solved.items()
+            }
             for title, some in chosen.items()
             if some.any()
         },
@@ -138,14 +181,20 @@ def _measured(
 
 
 def _print(facts: dict[str, Any], attempts: int, console: Console) -> None:
+    counts = {title: next(iter(players.values()))["levels"] for title, players in facts["of"].items()}
     for title, players in facts["of"].items():
-        count = next(iter(players.values()))["levels"]
+        count = counts[title]
+        if title != ALL and count == counts[ALL]:
+            continue  # the same levels
         console.print(f"{facts['levels']}: {many(count, 'level')} ({title})", soft_wrap=True)
         table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 1))
-        for column in ("", "one attempt", f"best of {attempts}", "worst tenth"):
+        for column in ("", "one attempt", f"best of {attempts}", "worst tenth", "steps"):
             table.add_column(column, justify="right" if table.columns else "left", no_wrap=True)
         for name, rates in players.items():
-            table.add_row(name, *(_shown_rate(rates[key]) for key in ("once", "best", "worst")))
+            steps = "-" if rates["steps"] is None else f"{rates['steps']:.0f}"
+            table.add_row(name, *(_shown_rate(rates[key]) for key in ("once", "best", "worst")), steps)
+        for name, rate in facts["published"].items() if title == ALL else ():
+            table.add_row(name, f"{rate:.0%}", "-", "-", "-")
         console.print(table)
         console.print()
 

@@ -1,25 +1,32 @@
 """The levels that a policy is measured on: of a split, of level files, or sealed ones."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
+import jax
 import numpy as np
+import pyarrow as pa
 from jaxtyping import Bool, Int
 
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.labels import Label
+from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import Level, name_of, size_of
 from levelproof.levelgen.sampling.sampler import check_size, sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
+from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.learn.sealed import SEALED, known_sealed
 from levelproof.pipeline.read.level_files import levels_at, levels_below
 from levelproof.pipeline.read.levels import COLUMNS, levels_of, rules_of
 from levelproof.pipeline.read.select import columns_in, select
 from levelproof.pipeline.store.manifest import fragment_paths, require_manifest
 from levelproof.pipeline.store.remote import is_remote
+from levelproof.pipeline.store.seed.file import is_seed
 
-SEALED = range(2_000_000_000, 2_000_002_048)  # ids of the levels that policies are measured on, and never trained
+AT_ONCE = 256  # witnesses that are read together
 
 
 class MeasuredLevels(NamedTuple):
@@ -30,6 +37,16 @@ class MeasuredLevels(NamedTuple):
     levels: Level  # on the host, level axis last
     rules: TaskParams
     solved: Bool[np.ndarray, " level"] | None  # whether they are labelled solved; None: they have no labels
+    start: float = 0.0  # where in their witnesses attempts start, as a share of the steps to the goal
+    published: Mapping[str, float] = MappingProxyType({})  # solve rates by agent that others published for them
+
+    def first(self, count: int | None) -> "MeasuredLevels":
+        """Return the first `count` levels; None: all."""
+        if count is None:
+            return self
+        some = np.arange(len(self.level_ids))[:count]
+        solved = None if self.solved is None else self.solved[some]
+        return self._replace(level_ids=self.level_ids[some], levels=take(self.levels, some), solved=solved)
 
 
 def sealed_levels(size: str, count: int | None) -> MeasuredLevels:
@@ -43,7 +60,14 @@ def sealed_levels(size: str, count: int | None) -> MeasuredLevels:
     except ValueError as error:
         raise UserError(f"Cannot sample sealed levels: {error}: set --size to s, m or l.") from None
     ids = np.array(SEALED[:count], np.int32)
-    return MeasuredLevels(f"sealed {size}", ids, sample_levels(ids, size), DEFAULT_RULES, None)
+    known = known_sealed(size)
+    solved = known and known.solved[:count]
+    return MeasuredLevels(f"sealed {size}", ids, sample_levels(ids, size), DEFAULT_RULES, solved)
+
+
+def is_split(place: Path) -> bool:
+    """Whether a path or URL is that of a split."""
+    return is_remote(place) or is_seed(place) or (place.is_dir() and bool(fragment_paths(place)))
 
 
 def levels_in(
@@ -57,7 +81,7 @@ def levels_in(
         UserError: there is no split and no usable level file, or no level meets the condition.
         Failure: the split is damaged.
     """
-    if is_remote(place) or (place.is_dir() and fragment_paths(place)):
+    if is_split(place):
         yield _of_split(place, where, count)
         return
     if where is not None:
@@ -77,8 +101,9 @@ def levels_in(
 
 
 def _of_split(split: Path, where: str | None, count: int | None) -> MeasuredLevels:
-    manifest = require_manifest(split, ["level_id", *COLUMNS, *columns_in(where)])
-    rows = select(manifest.table, where)[:count]
+    chosen = select(require_manifest(split, columns_in(where)).table, where)["level_id"].to_numpy()[:count]
+    manifest = require_manifest(split, COLUMNS, chosen)
+    rows = manifest.table
     if not rows.num_rows:
         raise UserError(
             f"{split} has no level that meets the condition: `levelproof inspect {split}` shows its levels."
@@ -87,3 +112,24 @@ def _of_split(split: Path, where: str | None, count: int | None) -> MeasuredLeve
     solved = np.array([label == Label.SOLVED for label in labels])
     name = f"{split}, {name_of(levels.size)}"
     return MeasuredLevels(name, rows["level_id"].to_numpy(), levels, rules_of(manifest), solved)
+
+
+def midway_levels(split: Path, where: str | None, count: int | None, start: float) -> MeasuredLevels:
+    """Return the levels of a split that have a witness, each in the state at a share `start` of its way to the goal.
+
+    Raises:
+        UserError: no level that meets the condition has a witness.
+        Failure: the split is damaged.
+    """
+    data = Dataset(split, where, (), 0.0)
+    steps = data.manifest["steps_to_goal"]
+    witnessed = np.flatnonzero(steps.is_valid().to_numpy())[:count]
+    if not len(witnessed):
+        raise UserError(f"No level of {split} that meets the condition has a witness: choose others with --where.")
+    at = (steps.take(pa.array(witnessed)).to_numpy() * start).astype(np.int64)
+    parts = [data.state(witnessed[i : i + AT_ONCE], at[i : i + AT_ONCE]).level for i in range(0, len(at), AT_ONCE)]
+    levels = jax.tree.map(lambda *xs: np.moveaxis(np.concatenate(xs), 0, -1), *parts)
+    name = f"{split}, {name_of(data.size)}, {start:.0%} into witnesses"
+    solved = np.array([label == Label.SOLVED for label in data.manifest["label"].take(pa.array(witnessed)).to_pylist()])
+    ids = data.manifest["level_id"].to_numpy()[witnessed]
+    return MeasuredLevels(name, ids, levels, data.rules, solved, start)

@@ -1,38 +1,61 @@
-"""Metrics of a run: JSON lines beside the policy, and the logger that the setting `log` names."""
+"""Metrics of a run: JSON lines and their curves beside the policy, and the logger that the setting `log` names."""
 
 import json
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from levelproof.pipeline.jobs.log import GuardedLog, require_library, writer_of
+from levelproof.pipeline.learn.curves import Curves, draw_curves
+from levelproof.pipeline.store.disk import read_regular
 from levelproof.pipeline.store.files import write
 
-METRICS, LOG = "metrics.jsonl", "log"
-STEP = "bc/updates"  # the metric that the others are plotted over
+METRICS, CURVES, LOG = "metrics.jsonl", "curves.png", "log"
 
 
 class Metrics:
-    """Appends to `metrics.jsonl`. If a logger fails, the user is told once, and the run continues without it."""
+    """Appends to `metrics.jsonl`, and draws it as `curves.png`.
 
-    def __init__(self, folder: Path, log: str, settings: Mapping[str, Any], updates: int, say: Callable[[str], None]):
-        """Open the files of a run in `folder` that has taken `updates` updates; forget what is of later ones.
+    If a logger fails, the user is told once, and the run continues without it.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        curves: Curves,
+        log: str,
+        settings: Mapping[str, Any],
+        steps: int,
+        say: Callable[[str], None],
+    ):
+        """Open the files of a run in `folder` that has come to `steps` of its curves; forget what is of later ones.
 
         Raises:
-            UserError: the logger's library is missing.
+            UserError: the logger's library is missing, or a link or the like has the name of a file.
         """
         require_library(log)
-        self._path, self._log = folder / METRICS, GuardedLog(log, say)
-        lines = self._path.read_text().splitlines() if self._path.exists() else []
-        kept = [line for line in lines if line.endswith("}") and json.loads(line)[STEP] <= updates]
+        self._path, self._curves, self._log = folder / METRICS, curves, GuardedLog(log, say)
+        lines = read_regular(self._path).decode().splitlines() if os.path.lexists(self._path) else []
+        kept = [line for line in lines if line.endswith("}") and json.loads(line)[curves.step] <= steps]
         write(self._path, "".join(f"{line}\n" for line in kept).encode())
+        self.last: dict[str, float] = json.loads(kept[-1]) if kept else {}  # line that an earlier process wrote
         if log != "none":
-            self._log.open(lambda: writer_of(log, folder / LOG, STEP, folder.name, settings))
+            self._log.open(lambda: writer_of(log, folder / LOG, curves.step, folder.name, settings))
 
     def write(self, numbers: Mapping[str, float]) -> None:
         with self._path.open("a") as file:
             file.write(json.dumps(dict(numbers)) + "\n")
         self._log.use(lambda writer: writer.write(numbers))
+        self._draw()
+
+    def _draw(self) -> None:
+        lines = [json.loads(line) for line in self._path.read_text().splitlines()]
+        path = self._path.with_name(CURVES)
+        unfinished = path.with_name(f".{CURVES}")  # ends in .png, too
+        unfinished.unlink(missing_ok=True)  # what a killed process left, or a link to another file
+        draw_curves(lines, self._curves, unfinished)
+        unfinished.replace(path)
 
     def close(self, done: bool) -> None:
         self._log.use(lambda writer: writer.close(done))

@@ -15,13 +15,14 @@ from jaxtyping import Float, Int
 from levelproof.configs.clone import CloneConfig
 from levelproof.experts.imitation import Transitions
 from levelproof.levelgen.level import Level
-from levelproof.pipeline.dataset.batch import Batch
 from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.dataset.order import EpochOrder
+from levelproof.pipeline.learn.mirrored import Witnesses, mirrored
 from levelproof.pipeline.runtime import own_cores
 
 AT_ONCE = 64  # levels of a read
 MOTION_FIELDS = tuple(f"record/state/{name}" for name in ("position", "velocity", "rotation", "angular_velocity"))
+CONTACTS = "record/state/contact_active"
 VALIDATED = 1024  # largest number of levels of a split that are validated on
 DRAWN = 8  # transitions of each of them
 
@@ -48,39 +49,52 @@ class PartedSplit(NamedTuple):
     data: Dataset
     train: Int[np.ndarray, " level"]
     validation: Int[np.ndarray, " level"]
+    copies: int  # levels in neither, because they have the content of sealed levels
 
 
 def read_pool(
-    data: Dataset, indices: Int[np.ndarray, " level"], whole: bool, follow: Callable[[int], None] = lambda _: None
+    data: Dataset,
+    indices: Int[np.ndarray, " level"],
+    config: CloneConfig,
+    follow: Callable[[int], None] = lambda _: None,
 ) -> LevelPool:
-    """Read levels into memory; `follow` is told of each read how many levels it had."""
+    """Read levels into memory, and their mirror images if configured; `follow` is passed the number in each read."""
+    names = (*MOTION_FIELDS, *([CONTACTS] if config.network.reads_contacts else []))
 
     def read(some: Int[np.ndarray, " level"]) -> LevelPool:
-        batch = data.read(some, fields=["level", *MOTION_FIELDS], observation=None)
-        return _cut(batch, whole)
+        batch = data.read(some, fields=["level", *names], observation=None)
+        whole, fields = config.episodes == "all", [batch.fields[name] for name in names]
+        pool = _cut(Witnesses(batch.level, fields, batch.done, batch.action), whole)
+        return _joined([pool, _cut(mirrored(batch, names, whole, data.rules), whole)]) if config.mirror else pool
 
     with ThreadPoolExecutor(len(own_cores())) as threads:
         parts = []
         for part in threads.map(read, (indices[i : i + AT_ONCE] for i in range(0, len(indices), AT_ONCE))):
             parts.append(part)
             follow(len(part.steps))
+    return _joined(parts)
+
+
+def _joined(parts: Sequence[LevelPool]) -> LevelPool:
     steps = np.concatenate([part.steps for part in parts])
     level = jax.tree.map(lambda *xs: np.concatenate(xs, -1), *(part.level for part in parts))
-    motion, action = (np.concatenate([part[i] for part in parts]) for i in (3, 4))
+    motion, action = (np.concatenate([getattr(part, name) for part in parts]) for name in ("motion", "action"))
     return LevelPool(level, np.cumsum(steps) - steps, steps, motion, action)
 
 
-def _cut(batch: Batch, whole: bool) -> LevelPool:
+def _cut(witnesses: Witnesses, whole: bool) -> LevelPool:
     """Keep the steps that are trained on, and of states what moves."""
-    count, length = batch.done.shape
-    ends = np.where(batch.done.any(1), batch.done.argmax(1) + 1, length)
+    done, moving = witnesses.done, len(MOTION_FIELDS)
+    motion, contacts = witnesses.fields[:moving], witnesses.fields[moving:]
+    count, length = done.shape
+    ends = np.where(done.any(1), done.argmax(1) + 1, length)
     steps = np.full(count, length) if whole else ends
     kept = np.arange(length) < steps[:, None]
-    parts = [batch.fields[name] for name in MOTION_FIELDS]
-    columns = [x if x.ndim == 4 else x[..., None] for x in parts]
-    motion = np.concatenate(columns, -1).reshape(count, length, -1)[kept]
-    level = jax.tree.map(lambda x: np.moveaxis(x, 0, -1), replace(batch.level, state=None))  # pyright: ignore
-    return LevelPool(level, np.cumsum(steps) - steps, steps, motion, batch.action[kept].astype(np.int8))
+    columns = [x if x.ndim == 4 else x[..., None] for x in motion]
+    rows = np.concatenate(columns, -1).reshape(count, length, -1)
+    rows = np.concatenate([rows, *contacts], -1, dtype=np.float32)[kept]
+    level = jax.tree.map(lambda x: np.moveaxis(x, 0, -1), replace(witnesses.level, state=None))  # pyright: ignore
+    return LevelPool(level, np.cumsum(steps) - steps, steps, rows, witnesses.action[kept].astype(np.int8))
 
 
 class Feed:
@@ -121,7 +135,7 @@ class Feed:
         pools = []
         for source, order in zip(self._sources, self._orders, strict=True):
             items, _ = order.items(turn)  # an epoch's last round is filled up with levels of the next one's first
-            pools.append(read_pool(source.data, source.train[items], self._config.episodes == "all", self._follow))
+            pools.append(read_pool(source.data, source.train[items], self._config, self._follow))
         return pools
 
     def _draw(self, pools: Sequence[LevelPool], update: int) -> Transitions:
@@ -135,7 +149,7 @@ def validation_batches(source: PartedSplit, config: CloneConfig) -> list[Transit
     """Return whole batches of transitions of a split's validation levels, the same in every run."""
     rng = np.random.default_rng(config.seed)
     chosen = rng.permutation(source.validation)[:VALIDATED]
-    pool = read_pool(source.data, chosen, config.episodes == "all")
+    pool = read_pool(source.data, chosen, replace(config, mirror=False))
     levels = np.tile(np.arange(len(chosen)), DRAWN)
     batch = config.train.batch
     padded = np.resize(levels, -(-len(levels) // batch) * batch)

@@ -25,6 +25,7 @@ from levelproof.pipeline.look.figures import draw_panels, draw_shares
 from levelproof.pipeline.look.preview import preview
 from levelproof.pipeline.look.readme import FIGURES, MARK, PREVIEW, RATES, SHEET, STEPS, CardOptions, SplitFacts, readme
 from levelproof.pipeline.read.levels import distribution_of, writing_to
+from levelproof.pipeline.store.disk import NotRegular
 from levelproof.pipeline.store.layout import SHARDS
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 from levelproof.pipeline.store.shard import stored_bytes
@@ -47,14 +48,14 @@ def card(splits: Sequence[Path], out: Path | None, options: CardOptions) -> None
     out = out or splits[0].absolute().parent.parent / README
     folder = out.absolute().parent.resolve()
     _require_ours(out)
-    _require_no_links([out])
+    _require_plain([out])
     paths = [_below(folder, split) for split in splits]
     manifests = [require_manifest(split, COLUMNS_READ, compact=True) for split in splits]
     facts = [_facts(path, manifest) for path, manifest in zip(paths, manifests, strict=True)]
     with writing_to(out):
         for name in (PREVIEW, FIGURES):
             (folder / name).mkdir(parents=True, exist_ok=True)
-            _require_no_links([folder / name, *(folder / name).iterdir()])
+            _require_plain([folder / name, *(folder / name).iterdir()])
         tables = [preview(manifest, SAMPLE) for manifest in manifests]
         for split_facts, table in zip(facts, tables, strict=True):
             pq.write_table(table, folder / PREVIEW / f"{split_facts.subset}.parquet", row_group_size=100)
@@ -73,10 +74,13 @@ def _require_ours(out: Path) -> None:
         raise UserError(f"{out} exists, but `levelproof card` did not write it: name another file with -o.")
 
 
-def _require_no_links(paths: Iterable[Path]) -> None:
-    """Refuse to write through links: the dataset, and thus its links, may be untrusted."""
-    if links := [path for path in paths if path.is_symlink()]:
-        raise UserError(f"{links[0]} is a link: remove it, then run the same command again.")
+def _require_plain(paths: Iterable[Path]) -> None:
+    """Refuse to write through links, hard links and pipes: the dataset, and thus they, may be untrusted."""
+    for path in paths:
+        if path.is_symlink():
+            raise UserError(f"{path} is a link: remove it, then run the same command again.")
+        if path.exists() and not path.is_dir() and (not path.is_file() or path.stat().st_nlink > 1):
+            raise NotRegular(path)
 
 
 def _below(folder: Path, split: Path) -> str:

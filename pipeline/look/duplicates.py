@@ -17,6 +17,7 @@ import pyarrow.compute as pc
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.store.columns import COLUMNS
 from levelproof.pipeline.store.manifest import require_manifest
+from levelproof.pipeline.store.seed.file import is_seed
 
 COMPARED = ("content_hash", "signature")
 # Candidates share half of a signature; equal content has equal signatures. Grouping 8-byte hashes takes a tenth of the
@@ -112,9 +113,9 @@ def comparison_of_source(source: Path) -> pa.Table:
         UserError: the source has neither, or a level file is invalid.
         Failure: a fragment is damaged.
     """
-    if source.is_file():
+    if source.is_file() and not is_seed(source):
         return _of_files([source])
-    if not source.is_dir() or (source / "manifest").is_dir():
+    if not source.is_dir() or (source / "manifest").is_dir() or is_seed(source):
         return comparison_table(require_manifest(source, COMPARED).table)
     if not (files := sorted(source.rglob("*.json"))):
         raise UserError(f"{source} has neither a split nor a level file: give a folder that has one.")

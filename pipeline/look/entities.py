@@ -1,4 +1,4 @@
-"""Share of levels solved, by how many bodies, joints, motors and thrusters they have; on a sample if they are many.
+"""Share of levels solved by number of bodies, joints, motors and thrusters; of a sample if there are many levels.
 
 No column counts entities: random levels are resampled from their ids, others are read from shards and level files.
 """
@@ -33,10 +33,10 @@ def count_entities(level: Level) -> dict[str, Int[np.ndarray, " level"]]:
 
 
 def solved_by_entities(manifest: Manifest, ids: np.ndarray) -> dict[str, Any]:
-    """For each kind of entity and each count: share solved of the trained levels with that many.
+    """Return, by kind of entity and by count, the share solved of the trained levels with that count.
 
-    `ids` are ascending. Only the first SAMPLED (or READ) count: levels are independent of their ids. `problem` says why
-    there is no answer: levels could not be read, or there are more than MANY, which take long enough without this.
+    `ids` are ascending. Only the first SAMPLED (or READ) levels are counted: levels are independent of their ids.
+    `problem` says why there are no shares: levels cannot be read, or there are more than MANY, which would take long.
     """
     if len(ids) > MANY:
         problem = f"not computed for more than {MANY:,} levels: choose some with --where"

@@ -63,7 +63,7 @@ def draw_shares(shares: Mapping[str, Share], title: str, path: Path) -> None:
         parts.append(line([(at(low), y), (at(high), y)], ROLE_COLOUR[Role.BLUE], 0.05))
         parts.append(disc((at(share.hits / share.total), y), 0.07, ROLE_COLOUR[Role.BLUE], ROLE_COLOUR[Role.BLUE]))
         parts.append(text((LABEL + AXIS + 0.15, y), str(share), INK, SMALL))
-    _write(parts, (LABEL + AXIS + VALUE, top + 0.8), path)
+    write_figure(parts, (LABEL + AXIS + VALUE, top + 0.8), path)
 
 
 def draw_panels(
@@ -100,7 +100,7 @@ def draw_panels(
         parts.append(text((left, low + HIGH + 0.18), f"{name}: {len(lines):,}", INK, SMALL))
         parts.append(text((left + PANEL, low + HIGH + 0.18), "100%", MUTED, SMALL, ends=True))
         parts += _ends((left, low), "update 1", str(last))
-    _write(parts, (0.3 + min(panels, ACROSS) * (PANEL + GAP), height + 0.5), path)
+    write_figure(parts, (0.3 + min(panels, ACROSS) * (PANEL + GAP), height + 0.5), path)
 
 
 def _ends(corner: tuple[float, float], first: str, last: str) -> list[str]:
@@ -129,7 +129,8 @@ def _histogram(shares: np.ndarray, corner: tuple[float, float], title: str) -> l
     ]
 
 
-def _write(parts: Sequence[str], size: tuple[float, float], path: Path) -> None:
+def write_figure(parts: Sequence[str], size: tuple[float, float], path: Path) -> None:
+    """Write elements as a picture of this size, in hundreds of pixels: SVG if the path ends so, else PNG."""
     width, height = size
     drawing = (
         f'<svg xmlns="http://www.w3.org/2000/svg" font-family="{FONTS}" width="{100 * SHARP * width:.0f}" '

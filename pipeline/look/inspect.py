@@ -14,6 +14,7 @@ import pyarrow.compute as pc
 from rich.console import Console
 
 from levelproof.configs.compose import name_and_hash
+from levelproof.configs.schema import REPEATED
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.labels import DIVERGED, Label
 from levelproof.pipeline.look import cost, duplicates
@@ -24,10 +25,9 @@ from levelproof.pipeline.look.query import ALL_ROWS, SHOWN, RowQuery, ids_of, ro
 from levelproof.pipeline.look.reasons import kinds_of_reasons
 from levelproof.pipeline.read.levels import distribution_of
 from levelproof.pipeline.read.select import columns_in, select
-from levelproof.pipeline.store.layout import data_path
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
+from levelproof.pipeline.store.named import bytes_named
 from levelproof.pipeline.store.remote import as_typed, is_listed
-from levelproof.pipeline.store.shard import stored_bytes
 
 QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
 SPENT = ("scout_steps", "search_steps", "env_steps", "evaluation_steps")  # env steps by stage
@@ -89,8 +89,10 @@ def _summary(split: Path, manifest: Manifest, chosen: pa.Table, labels: dict[str
     none = details.slice(0, 0)
     solved, unsolved = (of_label.get(label, none) for label in (Label.SOLVED, Label.UNSOLVED))
     tried = solved.num_rows + unsolved.num_rows
-    stored = sum(stored_bytes(data_path(split, shard)) for shard in manifest.shards) if is_listed(split) else None
+    stored = bytes_named(split, manifest.shards) if is_listed(split) else None
     kept = manifest.table.num_rows - manifest.table.column("shard").null_count
+    is_repeated = REPEATED.items() <= (manifest.config or {}).items()  # then the others are copies
+    transitions = _total(manifest.table["steps_to_goal"].to_numpy()) if is_repeated else kept * RECORD_STEPS
     distribution = distribution_of(manifest)
     return {
         "split": as_typed(split),
@@ -112,7 +114,7 @@ def _summary(split: Path, manifest: Manifest, chosen: pa.Table, labels: dict[str
         "env_steps_unsolved": _total(unsolved["env_steps"].to_numpy()),
         "cost": cost.cost_of(chosen),
         "split_bytes": stored,  # all shards, whatever the condition
-        "bytes_per_transition": stored / (kept * RECORD_STEPS) if stored and kept else None,
+        "bytes_per_transition": stored / transitions if stored and kept else None,
     }
 
 

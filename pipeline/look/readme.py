@@ -36,10 +36,10 @@ KINETIX = """\
 
 @dataclass(frozen=True)
 class CardOptions:
-    """What a card says that no split records."""
+    """Facts of a card that no split records."""
 
     license: str | None = None  # as the hub names it; None: not chosen yet
-    name: str | None = None  # of the dataset; None: its folder's name
+    name: str | None = None  # the dataset's name; None: its folder's name
     repo: str | None = None  # USER/NAME on the hub; None: not known yet
     code: str | None = None  # URL of the levelproof that made it; None: no link
 

@@ -1,4 +1,4 @@
-"""One level as a picture or a film: its witness or, if it has none, what doing nothing does."""
+"""One level as a picture or a film: its witness or, if it has none, what happens without actions."""
 
 import shutil
 import subprocess
@@ -31,7 +31,7 @@ from levelproof.pipeline.store.manifest import Manifest, require_manifest
 
 STEPS_A_PICTURE = 2  # env steps between the pictures of a film: 15 pictures/s
 LAST_SECONDS = 1.5  # s that a film rests on its last picture
-MAX_FRAME_SKIP = 8  # above, doing nothing is not played: a level file's rules may have any
+MAX_FRAME_SKIP = 8  # physics steps per env step, of which level files may have any number; above, no film is played
 SHOWN_SECONDS = (0.02, 2.0)  # minimum and maximum of a picture: rules may have any time step
 SHEET = (3, 2)  # columns and rows of a .png
 
@@ -179,7 +179,7 @@ def write_sheet(film: Film, path: Path) -> None:
 
 
 def write_mp4(film: Film, path: Path) -> None:
-    """Encode with ffmpeg: the machine's, or the one of the extra `video`.
+    """Encode with the ffmpeg of this machine or, if it has none, of the extra `video`.
 
     Raises:
         UserError: there is no ffmpeg.
@@ -223,8 +223,8 @@ WRITERS: dict[str, Callable[[Film, Path], object]] = {
 def _extrapolated(state: State, rules: TaskParams) -> State:
     """Extrapolate the last recorded state to the moment when the goal is touched.
 
-    Records keep the state before each env step; its last physics step finds the contact, after the others moved the
-    bodies.
+    Records keep the state before each env step. In the last env step, the first physics steps move the bodies, and
+    only the final one finds the contact.
     """
     seconds = (rules.frame_skip - 1) * rules.physics.dt
     return replace(

@@ -17,7 +17,7 @@ from levelproof.pipeline.words import many
 
 
 def status(split: Path, as_json: bool, say: Callable[[str], None]) -> None:
-    """Print how far `split` is; `say` receives a message if checking for a run takes long.
+    """Print the progress of `split`; `say` receives a message if checking for a run takes long.
 
     Raises:
         UserError: no split.

@@ -23,7 +23,7 @@ from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.words import duration, many
 
 INTERVAL = 2.0  # s between refreshes
-STALE = 30.0  # s; a run's state that is older is shown with its age
+STALE = 30.0  # s; an older state of a run is shown with its age
 SHOWN = 5  # maximum number of failures shown
 STATE = {"levels", "done", "solved", "env_steps", "rate", "left", "failures", "quarantined", "workers"}
 FAILURE = {"unit", "cause"}

@@ -14,18 +14,22 @@ from levelproof.experts.procedure import Procedure
 from levelproof.experts.witness.witness import steps_to_goal
 from levelproof.levelgen.files.level_file import LevelFile
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.look.gallery.attempts import Contender
 from levelproof.pipeline.play.server import HOST, serving
 from levelproof.pipeline.play.session import empty_file, witness_in
 from levelproof.pipeline.read.levels import find_level, is_level_file, level_file, levels_of, rules_of
+from levelproof.pipeline.read.policies import policy_at
 from levelproof.pipeline.read.rows import read_row
 from levelproof.pipeline.runtime import prepare_jax
 
 
-def play(source: Path | None, level_id: int | None, size: str, budget: str, port: int, browser: bool) -> None:
-    """Serve the page until Ctrl-C, and open it if `browser`.
+def play(
+    source: Path | None, level_id: int | None, size: str, budget: str, port: int, browser: bool, policy: Path
+) -> None:
+    """Serve the page until Ctrl-C, and open it if `browser`; the page lets the policy in the folder `policy` play.
 
     Raises:
-        UserError: no such level, size or budget, the file cannot be read, or the port is invalid or taken.
+        UserError: no such level, size, budget or policy, the file cannot be read, or the port is invalid or taken.
         Failure: the split is damaged.
     """
     prepare_jax()
@@ -35,7 +39,8 @@ def play(source: Path | None, level_id: int | None, size: str, budget: str, port
     except ValueError as error:
         raise UserError(f"{error}.") from None
     file, actions = level_to_play(source, level_id, size)
-    with serving(file, actions, procedure, env_steps, port) as server:
+    contender = Contender(policy_at(policy), 1)
+    with serving(file, actions, procedure, env_steps, port, contender) as server:
         address = f"http://{HOST}:{server.socket.getsockname()[1]}/"
         print(f"Play at {address} (Ctrl-C stops the server)", flush=True)
         if browser:

@@ -22,6 +22,7 @@ from levelproof.experts.procedure import Procedure
 from levelproof.levelgen.files.level_file import LevelFile
 from levelproof.levelgen.pictures.palette import palette_css
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.look.gallery.attempts import Contender
 from levelproof.pipeline.look.gallery.gallery import SITE
 from levelproof.pipeline.play.session import Message, Session
 from levelproof.pipeline.play.training import train_level
@@ -36,7 +37,12 @@ SOCKET = "/socket"
 
 @contextmanager
 def serving(
-    file: LevelFile, actions: np.ndarray | None, procedure: Procedure, budget: int, port: int
+    file: LevelFile,
+    actions: np.ndarray | None,
+    procedure: Procedure,
+    budget: int,
+    port: int,
+    contender: Contender | None = None,
 ) -> Iterator[Server]:
     """Serve pages that each start with this level, in the `with` block.
 
@@ -46,13 +52,14 @@ def serving(
         procedure: how levels are labelled.
         budget: env steps an expert may use.
         port: number; 0: any free port.
+        contender: the policy that pages let play, or None.
 
     Raises:
         UserError: the port is taken or invalid.
     """
 
     def handler(connection: ServerConnection) -> None:
-        PageConnection(connection, Session(file, actions), procedure, budget).run()
+        PageConnection(connection, Session(file, actions, contender), procedure, budget).run()
 
     try:
         server = serve(handler, HOST, port, process_request=_file, max_size=MAX_BYTES, compression=None)

@@ -20,6 +20,7 @@ from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.levelgen.task.rules import TaskParams, TaskState
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.look.gallery.attempts import Contender
 from levelproof.pipeline.look.gallery.worlds import drawn_bodies, world_of
 from levelproof.pipeline.version import __version__
 
@@ -31,10 +32,11 @@ Message = dict[str, Any]  # JSON object between page and server
 class Session:
     """State of one page's level; answers the requests named in `REQUESTS` with JSON types."""
 
-    def __init__(self, file: LevelFile, actions: np.ndarray | None = None) -> None:
-        """`actions`, [step, 6], are the level's witness, or None."""
+    def __init__(self, file: LevelFile, actions: np.ndarray | None = None, contender: Contender | None = None) -> None:
+        """`actions`, [step, 6], are the level's witness, or None; `contender` is the policy that the page lets play."""
         self._take(file)
         self._witness = actions
+        self._contender, self._attempts = contender, 0
         self._redo: list[Level] = []
         self._undo: list[Level] = []
 
@@ -71,6 +73,7 @@ class Session:
             "seconds": file.rules.frame_skip * file.rules.physics.dt,
             "steps": file.rules.max_timesteps,
             "witness": self._witness is not None,
+            "policy": self._contender is not None and self._contender.policy.can_play(file.level.size),
             "undo": bool(self._undo),
             "redo": bool(self._redo),
         }
@@ -137,11 +140,31 @@ class Session:
             raise UserError("There is no witness yet: reach the goal, or train an expert.")
         return self.film(self._witness)
 
+    def attempt(self, _: Message) -> Message:
+        """Film of the policy's next attempt, which is a witness if it reaches the goal."""
+        if self._contender is None or not self._contender.policy.can_play(self._file.level.size):
+            raise UserError("No policy plays this level: name one that does with `levelproof play --policy POLICY`.")
+        one = self._file.level, np.zeros(1, np.int32), self._file.rules
+        (attempt,) = self._contender.attempts(*one, seed=self._attempts)
+        self._attempts += 1
+        actions = np.asarray(attempt.record.action[: attempt.steps])
+        if attempt.solved:
+            self._witness = actions
+        return self.film(actions) | {"goal": attempt.solved}
+
     def film(self, actions: np.ndarray) -> Message:
-        """Replay actions [step, 6]; return the bodies' places before each and at the end."""
-        state = replay(self._file.level, _padded(actions), self._file.rules).state
-        position, rotation = (np.asarray(x)[: len(actions) + 1, ..., 0] for x in (state.position, state.rotation))
-        return {"places": places_of(self._file.level, position, rotation), "actions": actions.tolist()}
+        """Replay actions [step, 6]; return the bodies' positions and angles before each action and at the end."""
+        level, rules = self._file.level, self._file.rules
+        now = task.reset(level)
+        states = [now.state]
+        for action in actions:  # `replay` would reset the level when the episode ends, and lose its last state
+            now, _ = _advance(level, now, np.asarray(action, np.int32)[:, None], rules)
+            states.append(now.state)
+        position, rotation = (
+            np.stack([np.asarray(x)[..., 0] for x in xs])
+            for xs in ([state.position for state in states], [state.rotation for state in states])
+        )
+        return {"places": places_of(level, position, rotation), "actions": actions.tolist()}
 
     def solve(self, actions: np.ndarray) -> None:
         """Adopt a witness that an expert found."""
@@ -182,6 +205,7 @@ REQUESTS: dict[str, Callable[[Session, Message], Message]] = {
     for method in (
         Session.level, Session.restart, Session.step, Session.edit, Session.undo, Session.redo, Session.at,
         Session.empty, Session.load, Session.save, Session.play,
+        Session.attempt,
     )
 }  # fmt: skip
 

@@ -29,7 +29,7 @@ class LevelUnavailable(Failure):
 
 @dataclass(frozen=True)
 class Listing:
-    """Levels listing below a folder."""
+    """Levels of the files below a folder."""
 
     levels: dict[str, dict[int, Origin]] = field(default_factory=dict)  # by size and id, in path order
     copies: list[str] = field(default_factory=list)  # one sentence per file that repeats another file's level

@@ -1,5 +1,6 @@
 """Levels of a split by id, level files that users name, and the output files of single levels."""
 
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +13,7 @@ import pyarrow as pa
 from levelproof.configs.convert import typed
 from levelproof.configs.schema import from_files
 from levelproof.levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
+from levelproof.levelgen.identity.keys import ALIKE_VERSIONS, SAMPLER_VERSION
 from levelproof.levelgen.level import Level, size_of
 from levelproof.levelgen.sampling.sampler import Distribution, sample_levels
 from levelproof.levelgen.task.rules import TaskParams
@@ -23,6 +25,8 @@ from levelproof.pipeline.store.contents import level_fields
 from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 from levelproof.pipeline.store.origins import ASKED, origin_of
+from levelproof.pipeline.store.seed.file import is_seed
+from levelproof.pipeline.store.seed.shard import stored_levels
 from levelproof.pipeline.words import many
 
 COLUMNS = ("label", "label_reason", *ASKED)  # read for a level that is drawn or exported
@@ -64,12 +68,42 @@ def levels_of(manifest: Manifest, rows: pa.Table) -> Level:
     if not stored.all():
         prepare_jax()
         others, distribution = rows.filter(~stored), distribution_of(manifest)
-        if distribution is None:
+        check_sampler(manifest)
+        if distribution is None and is_seed(manifest.split):
+            parts.append(stored_levels(manifest.split, others.column("level_id").to_numpy()))
+        elif distribution is None:
             parts.append(levels_at([origin_of(manifest.split, row) for row in others.to_pylist()]))
         else:
             parts.append(sample_levels(others.column("level_id").to_numpy(), size, distribution))
     order = np.argsort(np.concatenate([np.flatnonzero(stored), np.flatnonzero(~stored)]))
     return jax.tree.map(lambda *lanes: np.concatenate(lanes, -1)[..., order], *parts)
+
+
+class SamplerDiffers(UserWarning):
+    """Levels sampled here differ from their split's in the last digits of their numbers."""
+
+
+def check_sampler(manifest: Manifest) -> None:
+    """Warn with SamplerDiffers if this version's sampler makes other bits from a split's ids than the one that made it.
+
+    Levels with a witness are read from shards, so they have the same bits in any version.
+
+    Raises:
+        Failure: it makes other levels.
+    """
+    made_with = (manifest.config or {}).get("sampler_version")
+    if made_with == SAMPLER_VERSION or from_files(manifest.config or {}):
+        return
+    what = f"The levels of {manifest.split} were sampled by version {made_with} of the sampler, and here it is version"
+    if made_with not in ALIKE_VERSIONS:
+        raise Failure(
+            f"{what} {SAMPLER_VERSION}, which makes others from their ids: use the levelproof that made them."
+        )
+    warnings.warn(
+        f"{what} {SAMPLER_VERSION}: those without a witness differ in the last places of their numbers.",
+        SamplerDiffers,
+        stacklevel=3,
+    )
 
 
 def distribution_of(manifest: Manifest) -> Distribution | None:
@@ -115,8 +149,8 @@ def writing_to(out: Path) -> Iterator[None]:
 
 
 def is_level_file(source: Path) -> bool:
-    """Whether a user who types this path means a level file, not a split."""
-    return source.is_file() or (source.suffix.lower() == ".json" and not source.is_dir())
+    """Whether a user who types this path means a level file, not a split or a seed file."""
+    return (source.is_file() and not is_seed(source)) or (source.suffix.lower() == ".json" and not source.is_dir())
 
 
 def level_file(path: Path, level_id: int | None = None) -> LevelFile:

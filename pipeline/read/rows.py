@@ -9,8 +9,9 @@ import pyarrow as pa
 
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.manifest import read_manifest
+from levelproof.pipeline.store.named import open_shard
 from levelproof.pipeline.store.remote import at_once
-from levelproof.pipeline.store.shard import Shard, open_shard, read_together
+from levelproof.pipeline.store.shard import Part, Shard, read_together
 
 COLUMNS = ("level_id", "size", "shard", "row")  # required of rows
 
@@ -20,7 +21,7 @@ Open = Callable[[Path, str, str], Shard]
 def read_rows(split: Path, rows: pa.Table, fields: Iterable[str] | None = None) -> dict[str, np.ndarray]:
     """Read arrays of these rows by field name, in row order: level axis last; time first in `record/` fields.
 
-    If a seal has current levels to another shard, rereads the manifest and retries.
+    If a seal has moved levels to another shard, rereads the manifest and retries.
 
     Args:
         split: path or URL of the split.
@@ -82,12 +83,22 @@ def gather_rows(
     Raises:
         Failure: a shard is missing or damaged, or its levels differ from the manifest.
     """
+    parts, places = parts_of(split, rows, opened)
+    return read_together(parts, fields, places=places)
+
+
+def parts_of(split: Path, rows: pa.Table, opened: Open = open_shard) -> tuple[list[Part], list[list[int]]]:
+    """Open the shards that rows name; return the rows of each, and their positions among `rows`.
+
+    Raises:
+        Failure: as `gather_rows`.
+    """
     ids, sizes, names, row = (rows.column(name).to_pylist() for name in COLUMNS)
     by_shard: dict[str, list[int]] = {}
     for i, name in enumerate(names):
         by_shard.setdefault(name, []).append(i)
     shards = at_once(split, lambda name, mine: opened(split, name, sizes[mine[0]]), by_shard, by_shard.values())
-    parts = [(shard, [row[i] for i in mine]) for shard, mine in zip(shards, by_shard.values(), strict=True)]
+    parts: list[Part] = [(shard, [row[i] for i in mine]) for shard, mine in zip(shards, by_shard.values(), strict=True)]
     for (shard, held), mine in zip(parts, by_shard.values(), strict=True):
         known = [shard.level_ids[k] if 0 <= k < len(shard.level_ids) else None for k in held]
         if known != [ids[i] for i in mine]:
@@ -95,4 +106,4 @@ def gather_rows(
                 f"The shard {shard.path} does not have the levels that the manifest lists: "
                 f"run `levelproof verify {split}`."
             )
-    return read_together(parts, fields, places=[*by_shard.values()])
+    return parts, [*by_shard.values()]

@@ -14,9 +14,9 @@ def with_bar(parts: Iterable[T], label: str, count: int | None = None, minimum: 
 
     Args:
         parts: items.
-        label: of the bar.
+        label: text beside the bar.
         count: number of items, if `parts` has no length.
-        minimum: of `count`, for which a bar is shown.
+        minimum: smallest `count` for which a bar is shown.
     """
     if count is not None and count < minimum:
         return parts

@@ -1,4 +1,4 @@
-"""Untrusted fragments: nothing is decompressed before its size is known.
+"""Untrusted fragments and seed files: nothing is decompressed before its size is known.
 
 The reader checks the footer's length, the columns, the numbers of rows and row groups, and the headers of the pages
 that it reads. It parses these itself: if a footer lies, some calls of Arrow end the process. Strings are read as
@@ -8,6 +8,7 @@ small; strings without a dictionary are as long as their pages.
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -18,18 +19,16 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from levelproof.pipeline.store.checksums import TAIL
-from levelproof.pipeline.store.columns import COLUMNS, OWN, schema_of
+from levelproof.pipeline.store.columns import COLUMNS, OWN, REPETITIVE, schema_of
 from levelproof.pipeline.store.remote import bytes_of, is_remote
 from levelproof.pipeline.store.thrift import PLAIN, Column, footer_in, pages_in
 
 MAX_FOOTER = 2**24  # bytes; most of them are digests
 MAX_ROWS, MAX_GROUPS = 2**20, 2**9  # of a fragment; a sealed one has 100,000 rows, in groups of 16,384
-MIN_ROW_BYTES = 8  # of a file per row: content hashes alone take more, however they are compressed
-# Bytes in memory: per read, per row, and per learning curve (with as many updates as the largest budgets have)
-MAX_FIXED, MAX_A_ROW, MAX_A_CURVE = 2**26, 2**12, 2**17
+MAX_FIXED = 2**26  # bytes in memory, per read
 A_VALUE = 16  # bytes that a value takes besides those of its page
-CURVE = "learning_curve"
-UNSEEN = "content_hash"  # is compared and never printed
+UNSEEN = "content_hash"  # only compared, never printed, so its characters are not checked
+ARROW_SCHEMA = b"ARROW:schema"  # key of metadata
 WRITER = "parquet-cpp-arrow"  # from files of other writers, Arrow may read more than the footer says
 # What reading untrusted bytes can raise
 DAMAGE = (OSError, pa.ArrowException, LookupError, ValueError, TypeError, AttributeError, RuntimeError, MemoryError)
@@ -41,33 +40,63 @@ READ_OPTIONS = {
 }
 
 
-class Bounded:
-    """A parquet file, open for reading the columns of a fragment within bounds."""
+@dataclass(frozen=True, eq=False)
+class FileKind:
+    """A kind of parquet file, and how large its valid files can be."""
 
-    def __init__(self, source: pa.NativeFile) -> None:
+    name: str
+    columns: pa.Schema  # of all versions
+    repetitive: tuple[str, ...]  # string columns that may be returned as dictionaries
+    own: tuple[str, ...]  # columns of bytes or strings without dictionaries; their positions are fixed
+    encoding: int  # of the pages of `own`
+    max_rows: int
+    min_row_bytes: int  # of a file, per row
+    max_row: int  # bytes in memory, per row
+    max_of: dict[str, int] = field(default_factory=dict)  # bytes in memory that a row of a column may take besides
+
+
+FRAGMENTS = FileKind(
+    "fragment",
+    COLUMNS,
+    REPETITIVE,
+    OWN,
+    PLAIN,
+    MAX_ROWS,
+    min_row_bytes=8,  # content hashes alone take more, however well they are compressed
+    max_row=2**12,
+    max_of={"learning_curve": 2**17},  # with as many updates as the largest budgets have
+)
+
+
+class Bounded:
+    """A parquet file, open for reading the columns of its kind within bounds."""
+
+    def __init__(self, source: pa.NativeFile, kind: FileKind = FRAGMENTS) -> None:
         """Check the footer.
 
         Raises:
-            One of DAMAGE: it is invalid, or larger than that of any fragment.
+            One of DAMAGE: it is invalid, or larger than that of any file of its kind.
         """
-        self._source, size = source, source.size()
+        self._source, self._kind, size = source, kind, source.size()
         source.seek(max(0, size - TAIL))
         length = int.from_bytes(source.read(4), "little")
         if length > min(MAX_FOOTER, size - TAIL):
-            raise ValueError("its footer is longer than that of any fragment")
+            raise ValueError(f"its footer is longer than that of any {kind.name}")
         source.seek(size - TAIL - length)
         self.rows, self._groups, made_by = footer_in(source.read(length))
-        if not 0 <= self.rows <= min(MAX_ROWS, size // MIN_ROW_BYTES) or len(self._groups) > MAX_GROUPS:
-            raise ValueError("it has more rows than any fragment of its size")
+        if not 0 <= self.rows <= min(kind.max_rows, size // kind.min_row_bytes) or len(self._groups) > MAX_GROUPS:
+            raise ValueError(f"it has more rows than any {kind.name} of its size")
         if min((group.rows for group in self._groups), default=0) < 0 or sum(g.rows for g in self._groups) != self.rows:
             raise ValueError("the rows of its groups do not add up")
         if not made_by.startswith(WRITER):
             raise ValueError("it was written by another library")
         # The positions of these columns are the same in every version
-        own = [i for i, leaf in enumerate(_expected(tuple(COLUMNS.names)).leaves) if _column_of(leaf) in OWN]
+        names = tuple(kind.columns.names)
+        own = [i for i, leaf in enumerate(_expected(kind, names).leaves) if _column_of(leaf) in kind.own]
         self._are_plain = not any(group.columns[i].has_dictionary for group in self._groups for i in own)
-        self._file = _open(source, _expected(tuple(COLUMNS.names), self._are_plain).texts)
-        self.metadata: dict[bytes, bytes] = self._file.schema_arrow.metadata or {}
+        self._file = _open(source, _expected(kind, names, self._are_plain).texts)
+        stored: dict[bytes, bytes] = self._file.metadata.metadata or {}  # also what was added after the schema
+        self.metadata = {key: value for key, value in stored.items() if key != ARROW_SCHEMA}
 
     def read(
         self,
@@ -87,15 +116,15 @@ class Bounded:
         Raises:
             One of DAMAGE: the file is damaged, or would take too much memory.
         """
-        known = _expected(tuple(all_names), self._are_plain)
+        known = _expected(self._kind, tuple(all_names), self._are_plain)
         if not self._file.schema.equals(known.schema) or not self._file.schema_arrow.equals(known.as_read):
-            raise ValueError("its columns are not those of a fragment")
+            raise ValueError(f"its columns are not those of a {self._kind.name}")
         groups = range(len(self._groups))
         if level_ids is not None and groups[1:]:
             matches = np.isin(self._read(known, groups, ["level_id"]).column(0).to_numpy(), level_ids)
             ends = np.cumsum([group.rows for group in self._groups])
             groups = np.unique(np.searchsorted(ends, np.flatnonzero(matches), "right")).tolist()
-        table, wanted = self._read(known, groups, names), schema_of(names, compact)
+        table, wanted = self._read(known, groups, names), _schema_of(self._kind, names, compact)
         stored = {name: table.column(name) for name in names}
         expanded = [name for name, column in stored.items() if column.type != wanted.field(name).type]
         if any(map(_has_controls, (chunk for name in names if name != UNSEEN for chunk in stored[name].chunks))):
@@ -127,25 +156,27 @@ class Bounded:
         pages = list(pages_in(chunk)) if column.values else []  # without values, Arrow writes no offset, reads no page
         values = sum(page.values for page in pages if not page.is_dictionary)
         if values != column.values or (values != rows and leaf.max_repetition_level == 0):
-            raise ValueError("a column has not one value per row")
-        if is_plain and any(page.is_dictionary or page.encoding != PLAIN for page in pages):
-            raise ValueError("strings of it are not encoded as they were written")
+            raise ValueError("a column does not have one value per row")
+        if is_plain and any(page.is_dictionary or page.encoding != self._kind.encoding for page in pages):
+            raise ValueError("a column's strings are not encoded as this program writes them")
         return sum(page.bytes + A_VALUE * page.values for page in pages)
 
     def _require_room(self, wanted: int, names: Sequence[str]) -> None:
         """Raise ValueError if `wanted` bytes are more than these columns take in any fragment."""
-        if wanted > MAX_FIXED + (MAX_A_ROW + MAX_A_CURVE * (CURVE in names)) * self.rows:
-            raise ValueError("its rows would take more memory than those of any fragment")
+        kind = self._kind
+        most = kind.max_row + sum(most for name, most in kind.max_of.items() if name in names)
+        if wanted > MAX_FIXED + most * self.rows:
+            raise ValueError(f"its rows would take more memory than those of any {kind.name}")
 
 
 @contextmanager
-def bounded(path: Path) -> Iterator[Bounded]:
-    """Open a fragment's file, local or remote.
+def bounded(path: Path, kind: FileKind = FRAGMENTS) -> Iterator[Bounded]:
+    """Open a file of a kind, local or remote.
 
     Raises: as `Bounded`; FileNotFoundError: it is missing.
     """
     with pa.BufferReader(bytes_of(path)) if is_remote(path) else pa.OSFile(str(path)) as source:
-        yield Bounded(source)
+        yield Bounded(source, kind)
 
 
 def _has_controls(column: pa.Array) -> bool:
@@ -186,24 +217,29 @@ class _Expected(NamedTuple):
 
 
 @cache
-def _expected(names: tuple[str, ...], own_are_plain: bool = False) -> _Expected:
-    """Return the schema of a file with these columns; with `own_are_plain`, those in OWN have no dictionaries."""
+def _expected(kind: FileKind, names: tuple[str, ...], own_are_plain: bool = False) -> _Expected:
+    """Return the schema of a file with these columns; with `own_are_plain`, `kind.own` have no dictionaries."""
     sink = pa.BufferOutputStream()
-    pq.write_table(schema_of(names).empty_table(), sink)
+    pq.write_table(_schema_of(kind, names).empty_table(), sink)
     schema = pq.ParquetFile(pa.BufferReader(sink.getvalue())).schema
     leaves = [schema.column(i) for i in range(len(schema))]
-    plain = [leaf.path for leaf in leaves if own_are_plain and _column_of(leaf) in OWN]
+    plain = [leaf.path for leaf in leaves if own_are_plain and _column_of(leaf) in kind.own]
     texts = [leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY" and leaf.path not in plain]
     return _Expected(schema, _open(pa.BufferReader(sink.getvalue()), texts).schema_arrow, leaves, texts, plain)
+
+
+def _schema_of(kind: FileKind, names: Sequence[str], compact: bool = False) -> pa.Schema:
+    return schema_of(names, compact, kind.columns, kind.repetitive)
 
 
 def _column_of(leaf: pq.ColumnSchema) -> str:
     return leaf.path.partition(".")[0]
 
 
-def with_dictionaries() -> list[str]:
-    """Return the paths of a fragment's leaves that are written with dictionaries."""
-    return [leaf.path for leaf in _expected(tuple(COLUMNS.names)).leaves if _column_of(leaf) not in OWN]
+def with_dictionaries(kind: FileKind = FRAGMENTS) -> list[str]:
+    """Return the paths of a file's leaves that are written with dictionaries."""
+    leaves = _expected(kind, tuple(kind.columns.names)).leaves
+    return [leaf.path for leaf in leaves if _column_of(leaf) not in kind.own]
 
 
 def _open(source: pa.NativeFile, texts: list[str]) -> pq.ParquetFile:

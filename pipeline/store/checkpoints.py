@@ -149,7 +149,7 @@ def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, KeptExper
 
 
 def _kept_in(source: Path, level_ids: Sequence[int]) -> dict[int, tuple[str | None, str | None]]:
-    """Witness and checkpoint of these levels: a worker asks for every unit, and reads the fragments of its levels."""
+    """Return witness and checkpoint by level id; opens only these levels' fragments, as a worker calls it per unit."""
     if not (source / MANIFEST).is_dir():
         raise SourceUnseen(
             f"The worker on {socket.gethostname()} finds no split at {source}, from which to continue: "

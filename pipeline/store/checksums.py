@@ -22,7 +22,7 @@ TAIL = 8  # bytes at the end of a parquet file: the footer's length, and PAR1
 def digests_of(path: Path, known: Iterable[str] = ()) -> dict[str, str]:
     """Return the SHA-256 of all files below a folder, by relative path; for a file, its own under the empty path.
 
-    Links and other entries that are not regular files get a string that is no digest; links are not followed. On a
+    Links, which are not followed, and other entries that are not regular files get a string that is not a digest. On a
     server that does not list files, `known` names them.
 
     Raises:

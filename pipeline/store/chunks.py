@@ -148,7 +148,7 @@ def file_name(array: str, number: int, axes: int) -> str:
 
 
 def regular_file(shard: Path, name: str) -> Path:
-    """Return the path of a shard's file after checking that it is regular: no link, no pipe, which never ends.
+    """Return the path of a shard's file after checking that it is regular: not a link, nor a pipe, which never ends.
 
     Raises:
         ContentsError: links lead elsewhere.
@@ -163,7 +163,7 @@ def regular_file(shard: Path, name: str) -> Path:
 
 
 def _rows_a_file(about: dict[str, Any], shape: tuple[int, ...]) -> int:
-    """Read the number of levels per file from an array's metadata; 0 if this program does not store arrays so."""
+    """Read the number of levels per file from an array's metadata; 0 if this program does not store arrays this way."""
     grid, (sharding,) = about["chunk_grid"]["configuration"]["chunk_shape"], about["codecs"]
     inside = sharding["configuration"]
     endian = [codec.get("configuration", {}).get("endian", "little") for codec in inside["codecs"]]

@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from levelproof.experts.steps import Seconds
 
-MANIFEST_VERSION, OLDEST_VERSION = 7, 6  # written; still read
+MANIFEST_VERSION, OLDEST_VERSION = 8, 6  # written; still read
 
 # Columns that depend on the run and not on the level: in all others two runs of a job agree, bit for bit
 OF_THE_RUN = ("shard", "row", "experts", "seconds")
@@ -174,6 +174,13 @@ DESCRIBED = (
         ),
         f"Versions that made the row: {', '.join(STACK)}, and the sampler",
     ),
+    ManifestColumn(
+        "engine",
+        pa.int32(),
+        "Version of the arithmetic of a physics step",
+        null="earlier versions: 1",
+        since=8,
+    ),
     ManifestColumn("device", pa.string(), "Device that computed the row, such as `cpu: AMD EPYC`"),
     ManifestColumn("command", pa.string(), "Command that regenerates this row"),
     ManifestColumn(
@@ -193,12 +200,17 @@ VERSIONS = {
 }
 
 
-def schema_of(names: Sequence[str], compact: bool = False) -> pa.Schema:
+def schema_of(
+    names: Sequence[str],
+    compact: bool = False,
+    columns: pa.Schema = COLUMNS,
+    repetitive: Sequence[str] = REPETITIVE,
+) -> pa.Schema:
     """Return the schema of the named columns; `compact`: with repetitive ones as dictionaries."""
-    fields = [COLUMNS.field(name) for name in names]
+    fields = [columns.field(name) for name in names]
     if compact:
         as_dictionary = pa.dictionary(pa.int32(), pa.string())
-        fields = [field.with_type(as_dictionary) if field.name in REPETITIVE else field for field in fields]
+        fields = [field.with_type(as_dictionary) if field.name in repetitive else field for field in fields]
     return pa.schema(fields)
 
 

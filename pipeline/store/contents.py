@@ -64,9 +64,9 @@ def size_of_levels(arrays: Mapping[str, np.ndarray]) -> Size:
 
 @cache
 def blank_row(size: Size, encoding: Encoding) -> np.ndarray:
-    """Return FLAT's row for the empty level: its fields, its state in every key frame, and zeros elsewhere.
+    """Return the empty level's row of FLAT: its fields, its state in every key frame, and zeros elsewhere.
 
-    Rows are stored as their exclusive or with this one, which is mostly zero: nearly all levels share the scenery.
+    Rows are stored XORed with it; the result is mostly zero, because nearly all levels share the scenery.
     """
     empty, arrays = arrays_of(empty_level(size, 1), "level/"), {}
     table = table_for(size, encoding)

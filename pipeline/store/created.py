@@ -14,8 +14,8 @@ from levelproof.pipeline.store.scratch import scratch
 def new_folder(out: Path, replaces: Callable[[Path], bool] = lambda _: False) -> Iterator[Path]:
     """Yield a hidden folder beside `out`, which is renamed to `out` when the block ends.
 
-    After an exception it is removed. A killed process leaves `out` as it was, and its hidden folder to the next process
-    that writes `out`. An existing folder is replaced if `replaces` returns True for it.
+    After an exception it is removed. A killed process leaves `out` as it was, and a hidden folder, which the next
+    process that writes `out` removes. An existing folder is replaced if `replaces` returns True for it.
 
     Raises:
         UserError: `out` exists and may not be replaced, or cannot be written.

@@ -57,7 +57,7 @@ def kept(arrays: Mapping[str, np.ndarray], encoding: Encoding) -> dict[str, np.n
 
 
 def needed(wanted: Iterable[str], stored: Iterable[str]) -> set[str]:
-    """The stored fields that the wanted ones come from."""
+    """Return the stored fields from which `restored` copies or computes the wanted ones."""
     wanted, stored = set(wanted), set(stored)
     missing = wanted - stored
     if missing - {WIDE}:

@@ -1,4 +1,4 @@
-"""Files opened and written without harming others, flushing to the drive, and sentences for failed writes."""
+"""Opening and writing files without following links or changing other files, flushing, and errors of failed writes."""
 
 import errno
 import fcntl
@@ -58,8 +58,14 @@ def regular(path: str | Path, flags: int, mode: int = 0o666) -> int:
     return descriptor
 
 
+def read_regular(path: Path) -> bytes:
+    """Read a file that others may have made. Raises as `regular`."""
+    with open(path, "rb", opener=regular) as file:
+        return file.read()
+
+
 def write_new(path: Path, data: bytes, mode: int = 0o666) -> None:
-    """Replace what has this name by a new file, without changing the bytes of the old one; the umask narrows `mode`.
+    """Replace the file at `path` by a new one. Other names of the old file keep its bytes; the umask narrows `mode`.
 
     Raises:
         OSError: the write fails, or a folder has this name.
@@ -71,7 +77,7 @@ def write_new(path: Path, data: bytes, mode: int = 0o666) -> None:
 
 @contextmanager
 def explaining_writes(split: Path) -> Iterator[None]:
-    """Turn failed writes to a split in the `with` block into a sentence.
+    """Turn errors of failed writes to a split in the `with` block into a Failure that says what to do.
 
     Raises:
         Failure: a write fails.
@@ -85,7 +91,7 @@ def explaining_writes(split: Path) -> Iterator[None]:
 
 
 def refusal(error: OSError, folder: Path, reasons: Mapping[int, str] = REFUSALS) -> str:
-    """Say in a sentence, without its full stop, why a write failed and what to do; empty: for none of the `reasons`.
+    """Return why a write failed and what to do, a sentence without its full stop; empty if `reasons` lacks the error.
 
     The sentence names the error's file, which may lie on another disk than `folder`, or else `folder`.
     """
@@ -95,7 +101,7 @@ def refusal(error: OSError, folder: Path, reasons: Mapping[int, str] = REFUSALS)
 
 
 def flush(path: Path) -> None:
-    """Flush a file, or all below a folder, with its name and that of the folder it is in.
+    """Flush a file, or a folder with everything below it; also its name and its parent folder's name.
 
     Raises:
         OSError: the write fails.

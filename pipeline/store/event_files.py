@@ -1,6 +1,6 @@
 """Events of runs, as JSON lines in one small file per run below the split's `events/`.
 
-They are for people who watch: no commit and no reader of a split depends on them, so they may be deleted.
+They are for people who watch a run: no commit and no reader of a split depends on them, so they may be deleted.
 """
 
 import json
@@ -47,7 +47,7 @@ def runs_in(split: Path) -> list[Path]:
 
 
 def write_events(path: Path, events: Sequence[Event]) -> None:
-    """Replace a run's file as a whole. A failed write does not end the run."""
+    """Replace a run's file as a whole; failed writes are ignored, so that they do not end the run."""
     with suppress(OSError, LevelproofError):
         write(path, "".join(json.dumps(event) + "\n" for event in events).encode())
 

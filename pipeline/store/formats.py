@@ -13,9 +13,12 @@ import numpy as np
 from levelproof.configs.convert import plain, typed
 from levelproof.configs.errors import ConfigError
 from levelproof.configs.schema import KEY_EVERY, KEYS_EVERY, MAX_FRAME_SKIP, Density
+from levelproof.levelgen.identity.keys import SAMPLER_VERSION
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
+from levelproof.physics.step import ENGINE_VERSION
 
 SHARD_VERSION = 2
+FIRST_VERSION = 1  # of the sampler and the engine of shards that do not name them
 
 # Keys of a fragment's metadata
 VERSION_KEY = b"levelproof.manifest_version"
@@ -42,11 +45,14 @@ class Encoding:
 
     density: Density = "full"
     key_every: int = KEY_EVERY  # env steps of an episode between key frames; `witness` only
-    rules: TaskParams = DEFAULT_RULES  # with which missing fields are recomputed
+    rules: TaskParams = DEFAULT_RULES  # the task's rules, to recompute fields that are not stored
+    sampler_version: int = SAMPLER_VERSION  # of the sampler that made the levels
+    engine_version: int = ENGINE_VERSION  # of the engine that made the records
 
     def as_json(self) -> dict[str, Any]:
         keys = {"key_every": self.key_every} if self.density == "witness" else {}
-        return {"density": self.density, **keys, "task": plain(self.rules)}
+        made_with = {"sampler_version": self.sampler_version, "engine_version": self.engine_version}
+        return {"density": self.density, **keys, "task": plain(self.rules), **made_with}
 
     @staticmethod
     def of(attributes: Mapping[str, Any]) -> "Encoding":
@@ -57,9 +63,12 @@ class Encoding:
         """
         try:
             density, key_every = attributes["density"], attributes.get("key_every", KEY_EVERY)
-            encoding = Encoding(density, key_every, typed(TaskParams, attributes["task"]))
+            made_with = [attributes.get(name, FIRST_VERSION) for name in ("sampler_version", "engine_version")]
+            encoding = Encoding(density, key_every, typed(TaskParams, attributes["task"]), *made_with)
         except (KeyError, TypeError, ConfigError) as error:
             raise ContentsError("its attributes do not say how records are stored") from error
+        if any(type(version) is not int for version in made_with):
+            raise ContentsError("its attributes do not say which versions made it")
         if density not in get_args(Density) or type(key_every) is not int or key_every not in KEYS_EVERY:
             raise ContentsError("its attributes do not say how records are stored")
         if density != "full" and encoding.rules.frame_skip > MAX_FRAME_SKIP:

@@ -17,7 +17,7 @@ from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
 from levelproof.levelgen.level import size_of
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.bounds import DAMAGE, bounded
-from levelproof.pipeline.store.columns import COLUMNS, MANIFEST_VERSION, VERSIONS, completed
+from levelproof.pipeline.store.columns import COLUMNS, MANIFEST_VERSION, OLDEST_VERSION, VERSIONS, completed
 from levelproof.pipeline.store.formats import CONFIG_KEY, DENSITIES_KEY, DIGESTS_KEY, HASH_KEY, SEALED_KEY, VERSION_KEY
 from levelproof.pipeline.store.layout import ids_of
 from levelproof.pipeline.store.remote import mended
@@ -60,12 +60,11 @@ def read_fragment(
                 raise ValueError("it has no version")
             if version not in VERSIONS:
                 raise Failure(
-                    f"The fragment {path} has manifest version {version[:9]}, but this program reads "
-                    f"{MANIFEST_VERSION}: "
-                    "use the levelproof that wrote it."
+                    f"The fragment {path} has manifest version {version[:9]}, but this program reads versions "
+                    f"{OLDEST_VERSION} to {MANIFEST_VERSION}: use the levelproof that wrote it."
                 )
             written = metadata[HASH_KEY].decode()
-            config, config_hash = _config_in(metadata[CONFIG_KEY], written)
+            config, config_hash = settings_in(metadata[CONFIG_KEY], written)
             digests, densities = _digests_in(metadata), _densities_in(metadata)
             fragment = Fragment(path, config_hash, config, digests, file.rows, SEALED_KEY in metadata, densities)
             wanted = COLUMNS.names if columns is None else columns
@@ -119,10 +118,13 @@ def _digests_in(metadata: Mapping[bytes, bytes]) -> dict[str, dict[str, str]]:
 
 
 @lru_cache(maxsize=8)
-def _config_in(text: bytes, written: str) -> tuple[dict[str, Any], str]:
+def settings_in(text: bytes, written: str) -> tuple[dict[str, Any], str]:
     """Parse a fragment's settings; return them with current names, and their hash. Most fragments repeat the last one.
 
     `written` is the hash beside them, from the version that wrote both.
+
+    Raises:
+        ValueError: they are invalid, or do not match the hash.
     """
     config = json.loads(text)
     if not isinstance(config, dict) or text.count(b"[") + text.count(b"{") > MAX_BRACKETS:

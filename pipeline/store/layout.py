@@ -123,8 +123,8 @@ def ids_of(path: Path) -> tuple[int, int]:
 def entries(split: Path, folder: str, paths: re.Pattern[str], is_kind: Callable[..., bool]) -> dict[Path, int]:
     """List the entries of a split's folder that match `paths` and a kind (`DirEntry.is_file`, `is_dir`).
 
-    There are none if the folder does not exist. Links match no kind. The values identify what has a path's name now:
-    inode numbers, or hashes of what a store says.
+    There are none if the folder does not exist. Links match no kind. The values identify the file that has the path
+    now: its inode number, or a hash of the store's metadata.
     """
     if is_remote(split):
         if folder == MANIFEST:

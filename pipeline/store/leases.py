@@ -1,7 +1,7 @@
 """The writer of a split: the lock file holds its token, and workers of any other writer commit nothing.
 
-In a folder the system excludes a second writer (`locks`). In an object store a writer renews a lease; another writer
-may take it after a long silence.
+In a folder, a file lock excludes a second writer (`locks`). In an object store, a writer renews a lease; another
+writer may take it after a long silence.
 
 Clocks are never compared: each process measures waits by its own. A split's integrity depends on no duration: a writer
 that was only slow finds its lease taken, as do its workers, before they commit anything.

@@ -1,28 +1,29 @@
-"""Locks between processes, held by open files: the system frees them when a process dies, however it dies.
+"""Locks between processes, held by open files: the operating system frees them however a process dies.
 
 Object stores have no locks: there `leases` and `publish` take their place.
 
-Lock files are opened for reading and writing: NFS emulates these locks by others, and grants a shared one only on a
-readable file, an exclusive one only on a writable file. Taking a lock raises LockRefused if the file system has none.
+Lock files are opened for reading and writing: NFS emulates these locks by byte-range locks, which are shared only on a
+readable file and exclusive only on a writable one. Taking a lock raises LockRefused if the file system has no locks.
 """
 
 import fcntl
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
-from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.store.disk import NotRegular, regular
 from levelproof.pipeline.store.layout import COMMIT_LOCK, WRITER_LOCK
 from levelproof.pipeline.store.leases import is_leased, leased, named, require_served
 from levelproof.pipeline.store.publish import publishing
 from levelproof.pipeline.store.remote import is_remote
 
-PATIENCE = 1.0  # s; `is_written` holds the writer's lock for a moment
+PATIENCE = 1.0  # s to wait for the writer's lock, because `is_written` holds it for a moment
 NOTICE = 2.0  # s of waiting before the user is told the reason
-POLL = 0.05  # s between two tries
+POLL = 0.05  # s between attempts to take a lock
 
 
 class LockRefused(UserError):
@@ -46,6 +47,35 @@ def only_writer(split: Path, say: Callable[[str], None]) -> Iterator[None]:
             raise UserError(f"Another `levelproof generate` is writing to {split}: wait for it, or stop it first.")
         with named(split, file):
             yield
+
+
+@contextmanager
+def only_clone(folder: Path) -> Iterator[Callable[[], None]]:
+    """Hold the writer lock of a policy's folder, which exists; yield a function to call before each write.
+
+    It raises Failure if the folder was removed or recreated, perhaps by a command that now holds its lock.
+
+    Raises:
+        UserError: another command is writing to it, its file system has no locks, or the lock is not a
+            regular file.
+    """
+    with open(folder / WRITER_LOCK, "a+", opener=regular) as file:
+        try:
+            taken = _taken_within(PATIENCE, file)
+        except LockRefused:
+            raise UserError(f"The file system of {folder} has no locks: choose another one with -o.") from None
+        if not taken:
+            raise UserError(f"Another command is writing a policy to {folder}: wait for it, or choose another -o.")
+
+        def require_ours() -> None:
+            try:
+                is_ours = os.path.samestat(os.fstat(file.fileno()), (folder / WRITER_LOCK).lstat())
+            except FileNotFoundError:
+                is_ours = False
+            if not is_ours:
+                raise Failure(f"{folder} was removed or recreated: this command writes nothing more there.")
+
+        yield require_ours
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Identity of this machine: host names are not unique, and process ids begin anew after each boot."""
+"""Identity of this machine: host names are not unique, and process ids restart after each boot."""
 
 from pathlib import Path
 

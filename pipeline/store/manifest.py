@@ -30,6 +30,8 @@ from levelproof.pipeline.store.fragment import FULL, Fragment, read_fragment
 from levelproof.pipeline.store.layout import FRAGMENT, MANIFEST, Attempt, entries, ids_of
 from levelproof.pipeline.store.remote import INDEX, is_remote
 from levelproof.pipeline.store.runs import ascending
+from levelproof.pipeline.store.seed.file import is_seed
+from levelproof.pipeline.store.seed.rows import seed_parts
 from levelproof.pipeline.urls import require_known
 
 MAX_SHOWN = 6  # differing settings that an error lists
@@ -90,7 +92,7 @@ def write_fragment(
 
 
 def settings_metadata(config_hash: str, config: Mapping[str, Any]) -> dict[bytes, bytes]:
-    """Return the metadata of a parquet schema that holds the settings, and with them the rules."""
+    """Return the metadata of a parquet schema that holds the settings, which include the task's rules."""
     return {
         VERSION_KEY: str(MANIFEST_VERSION).encode(),
         HASH_KEY: config_hash.encode(),
@@ -174,7 +176,7 @@ def read_manifest(
     """Read the manifest of a split, one row per level that was tried; empty if nothing is committed yet.
 
     Args:
-        split: the folder `{out}/{budget}/{size}`.
+        split: the folder `{out}/{budget}/{size}`, or a seed file, or a folder of some.
         columns: columns to read (default: all); `level_id` is always included.
         level_ids: levels to read (default: all); fragments whose name excludes all of them are not opened.
         compact: return repetitive columns as dictionaries, which for millions of rows take a tenth of the memory.
@@ -189,8 +191,10 @@ def read_manifest(
     if unknown := [name for name in names if name not in COLUMNS.names]:
         raise UserError(f"There is no column {unknown[0]!r}: the manifest has {', '.join(COLUMNS.names)}.")
     asked = None if level_ids is None else ascending(np.asarray(level_ids, np.int64))
-    read = partial(_part, names=names, level_ids=asked, compact=compact, each=each)
-    parts = _parts(split, asked, read)
+    if is_seed(split):
+        parts = seed_parts(split, names, asked, compact, each)
+    else:
+        parts = _parts(split, asked, partial(_part, names=names, level_ids=asked, compact=compact, each=each))
     fragments = tuple(fragment for fragment, _ in parts)
     for fragment in fragments[1:]:
         if fragment.config_hash != fragments[0].config_hash:
@@ -202,9 +206,9 @@ def read_manifest(
             )
     tables, superseded = [], []
     for neighbours in _overlapping(parts):
-        table, without = each_once(neighbours)
+        table, empty = each_once(neighbours)
         tables.append(table)
-        superseded += without
+        superseded += empty
     nothing = schema_of(names, compact).empty_table()
     table = pa.concat_tables([nothing if each is None else each(nothing), *tables]).unify_dictionaries()
     counting = [part for fragment, part in parts if fragment not in superseded]

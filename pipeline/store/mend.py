@@ -82,7 +82,7 @@ def _disown_named(split: Path, names: Collection[str]) -> None:
 
 
 def _moved(split: Path, rows: pa.Table, old: str, new: Path) -> pa.Table:
-    """Copy the levels of one shard to a new one, and return all rows with their new places."""
+    """Copy the levels of one shard to a new one, and return all rows with their new positions."""
     names, places, ids = (rows.column(name).to_pylist() for name in ("shard", "row", "level_id"))
     moving = [i for i, name in enumerate(names) if name == old]
     merge_shards(new, [Place(data_path(split, old), places[i], ids[i]) for i in moving])

@@ -19,7 +19,7 @@ from levelproof.pipeline.store.contents import ContentsError
 from levelproof.pipeline.store.disk import flush
 from levelproof.pipeline.store.shard import DAMAGE, Shard, damaged, stored_bytes
 
-FILE_BYTES = 64 * 2**20  # minimum of a file, if there is enough data; larger: longer indices to read before a chunk
+FILE_BYTES = 64 * 2**20  # minimum bytes per file, if there is enough data; larger files have longer indices to read
 MISSING = 2**64 - 1  # offset and length of a missing chunk in an index
 
 
@@ -42,7 +42,7 @@ def merge_shards(
     """Write trajectories, ordered by level id, to a new shard at `path`, durably.
 
     Args:
-        path: of the new shard.
+        path: path of the new shard.
         places: at least one; the shards must have equal fields and encodings.
         moved: called with 0 before each shard is opened, and with the bytes of each copied chunk; may raise to stop.
         rows_a_file: rows per file; default: the lowest power of two that reaches FILE_BYTES.

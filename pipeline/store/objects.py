@@ -1,6 +1,6 @@
 """Writing files of a split to an object store: each whole or not at all, some only if no other process was first.
 
-Any request may be repeated, also one that succeeded but whose response was lost. So a process that fails a precondition
+Any request may be repeated, even one that succeeded but whose response was lost. So a process whose precondition fails
 checks whether its own earlier request was the first. Knows nothing of the files' contents.
 """
 
@@ -52,8 +52,8 @@ def get(path: Path, most: float = inf) -> StoredFile:
     store, key = place(path)
 
     def request() -> StoredFile:
-        answer = obstore_module().get(store, key)
-        return StoredFile(data_of(answer, most), Version.of(answer.meta))
+        response = obstore_module().get(store, key)
+        return StoredFile(data_of(response, most), Version.of(response.meta))
 
     found = ask(path, request)
     if len(found.data) > most:
@@ -66,14 +66,14 @@ def begin_of(path: Path, most: int) -> tuple[bytes, int]:
     store, key = place(path)
 
     def request() -> tuple[bytes, int]:
-        answer = obstore_module().get(store, key, options={"range": (0, most)})
-        return data_of(answer, most), answer.meta["size"]
+        response = obstore_module().get(store, key, options={"range": (0, most)})
+        return data_of(response, most), response.meta["size"]
 
     return ask(path, request)
 
 
 def put(path: Path, data: bytes | Path) -> None:
-    """Write bytes, or a file of this machine, replacing what was there. Raises as `get`."""
+    """Write bytes, or a file of this machine, to `path`, replacing any file there. Raises as `get`."""
     store, key = place(path)
     ask(path, lambda: obstore_module().put(store, key, data, chunk_size=PART), "write")
 

@@ -41,6 +41,7 @@ from levelproof.pipeline.store.layout import (
     entries,
     ids_of,
 )
+from levelproof.pipeline.store.leases import require_served
 from levelproof.pipeline.store.provenance import versions
 from levelproof.pipeline.store.remote import as_typed, at_once, is_remote
 
@@ -73,6 +74,7 @@ def save_paused(split: Path, unit: str, paused: Mapping[int, Paused], job: JobCo
 
     Raises:
         OSError, UserError, StoreFailure: the write fails; the earlier checkpoint stays.
+        LeaseLost: this process works for a writer that no longer has the split; the earlier checkpoint stays.
     """
     rows = [paused[level_id] for level_id in sorted(paused)]
     stacked = jax.tree.map(lambda *xs: np.stack(xs), *map(_arrays, rows))
@@ -94,6 +96,7 @@ def save_paused(split: Path, unit: str, paused: Mapping[int, Paused], job: JobCo
         "bytes": len(archive),
         "sha256": hashlib.sha256(archive).hexdigest(),
     }
+    require_served(split)  # the next writer's workers save experts under the same names
     write(path, MAGIC + f"{VERSION} {json.dumps(head)}\n".encode() + archive, OWN)
 
 
@@ -129,7 +132,7 @@ def drop_paused(split: Path, unit: str, level_ids: Collection[int]) -> None:
 def prune_paused(split: Path, done: np.ndarray, say: Callable[[str], None]) -> None:
     """Remove checkpoints whose levels are all `done` (ascending ids), and damaged ones; call while no worker is active.
 
-    Reports through `say` which are damaged, and which stay because they cannot be read.
+    Reports damaged checkpoints, and those that stay because they cannot be read, through `say`.
     """
     for path in entries(split, CHECKPOINTS, CHECKPOINT_BEGUN, os.DirEntry.is_file):
         remove(path)

@@ -47,7 +47,7 @@ class PieceCache:
             if name in self._checked:
                 return os.pread(descriptor, last - first, first)
             data = os.pread(descriptor, about.st_size, 0)
-        except FileNotFoundError:  # another process made room
+        except FileNotFoundError:  # another process has just removed it
             return None
         finally:
             os.close(descriptor)

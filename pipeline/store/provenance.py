@@ -1,4 +1,7 @@
-"""Provenance of a row: versions and device. Equal bits are guaranteed on the same stack only."""
+"""Provenance of a row: the stack that made it, its versions and device.
+
+Sampling and replaying give the same bits on every CPU; training repeats on the same stack only.
+"""
 
 import functools
 import platform

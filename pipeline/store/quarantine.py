@@ -1,4 +1,7 @@
-"""Notes that say why units were given up; each is removed once all of its levels are committed, by whatever units."""
+"""Notes that say why units were given up.
+
+A note is removed once all of its levels are committed, whichever units they belong to by then.
+"""
 
 import os
 import re

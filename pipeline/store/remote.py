@@ -48,7 +48,7 @@ SIGN_IN = {
 STATUS = re.compile(r"status code: (\d{3}[A-Za-z ]*)")
 PASSING = re.compile(r"status code: (408|409|429|50[02-4])")
 NO_BUCKET = "NoSuchBucket"
-CUT_OFF, SILENT = "response body error", "HTTP error"  # a response ends early; there is none
+CUT_OFF, SILENT = "response body error", "HTTP error"  # a response ends early; no response arrives
 CLOUD = re.compile(r"latest/api/token|computeMetadata")  # endpoints where a cloud's machines get credentials
 COPY = {"s3:": "aws s3 sync", "gs:": "gcloud storage rsync -r", "az:": "azcopy sync", "hf:": "hf download"}
 
@@ -137,7 +137,7 @@ def names_in(folder: Path) -> list[Path]:
 
 
 def fragments_in(folder: Path) -> dict[Path, Stored]:
-    """List the manifest's folder, and forget the known metadata of the split's other files.
+    """List the manifest's folder, and drop cached metadata of the split's other files.
 
     Raises:
         UserError, StoreFailure: as `stored_in`; or a web server has no index.
@@ -203,7 +203,7 @@ class RemoteFile:
             yield b"".join(self._part(n, max(first - n * PIECE, 0), first + length - n * PIECE) for n in pieces)
 
     def close(self) -> None:
-        """Do nothing: no resource is held."""
+        """Do nothing: a remote file holds no resource."""
 
     def _piece(self, n: int) -> str:
         return f"{self._name}-{n}"
@@ -260,7 +260,7 @@ def _look_up(path: Path) -> Stored:
 
 
 def _tag(about: Any) -> str:
-    """Return a file's entity tag without its decoration, which differs by store; without a tag, its time."""
+    """Return a file's entity tag without its decoration, which differs by store; if it has no tag, its time."""
     return (about["e_tag"] or about["last_modified"].isoformat()).removeprefix("W/").strip('"')
 
 
@@ -333,13 +333,13 @@ def _cache_in(folder: Path, most: int) -> PieceCache:
 
 
 def data_of(answer: Any, most: float) -> bytes:
-    """Read the bytes of a response, stopping soon after `most` bytes: more bytes than that mean that it is too long."""
-    found = bytearray()
+    """Read the bytes of a response; stop soon after `most`, so that the caller sees that it is too long."""
+    data = bytearray()
     for part in answer.stream(min_chunk_size=PIECE):
-        found += part
-        if len(found) > most:
+        data += part
+        if len(data) > most:
             break
-    return bytes(found)
+    return bytes(data)
 
 
 def ask(path: Path, request: Callable[[], T], what: str = "read") -> T:

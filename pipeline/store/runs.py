@@ -8,7 +8,7 @@ MAX_SHOWN = 4  # runs of levels in a message
 
 
 def ascending(numbers: np.ndarray) -> np.ndarray:
-    """Sort numbers and drop duplicates. `np.unique` hashes integers, which for millions takes twenty times as long."""
+    """Sort numbers and drop duplicates. `np.unique` hashes integers: for millions, it takes twenty times as long."""
     ordered = np.sort(numbers)
     return ordered[np.diff(ordered, prepend=ordered[:1] - 1) != 0]
 

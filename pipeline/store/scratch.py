@@ -17,6 +17,7 @@ from pathlib import Path
 from tempfile import gettempdir, mkdtemp
 
 from levelproof.pipeline.store.machine import boot_id
+from levelproof.pipeline.store.remote import is_remote
 
 PREFIX = "levelproof-scratch-"
 LOCK, FILES = "lock", "files"
@@ -30,8 +31,8 @@ def scratch(parent: Path | None = None, prefix: str = PREFIX) -> Iterator[Path]:
     The first call of a process removes what killed processes left under this prefix.
 
     Args:
-        parent: of the folder (default: the system's folder for temporary files).
-        prefix: of the folder's name; no other files may have it.
+        parent: folder to create it in (default: the system's folder for temporary files).
+        prefix: start of the folder's name; the names of other files must not start with it.
 
     Raises:
         OSError: the write fails.
@@ -44,6 +45,11 @@ def scratch(parent: Path | None = None, prefix: str = PREFIX) -> Iterator[Path]:
     finally:
         _remove(folder)
         os.close(lock)
+
+
+def written_disk(split: Path) -> Path:
+    """Return the folder whose disk receives a process's writes: for a split in a store, that of temporary files."""
+    return Path(gettempdir()) if is_remote(split) else split
 
 
 def _made(parent: Path, prefix: str) -> tuple[Path, int]:
@@ -117,9 +123,9 @@ def _machine() -> dict[str, str]:
 
 
 def _is_here(about: bytes) -> bool:
-    """Whether a lock file names this machine, by its boot; by its host's name, which others may have, only without one.
+    """Whether a lock file names this machine, by its boot id or, if it has none, by its host name, which is not unique.
 
-    Folders from before a reboot stay: another machine of this name may have them.
+    Folders from before a reboot stay: they may belong to another machine with the same host name.
     """
     try:
         theirs = json.loads(about)

@@ -48,8 +48,8 @@ from levelproof.pipeline.store.publish import publishing
 from levelproof.pipeline.store.remote import is_remote
 from levelproof.pipeline.store.shard import Shard, damaged, read_together, write_shard
 
-ROWS = 100_000  # of a sealed fragment, about; more: fewer files, but more to rewrite when levels are added
-CONVERTED = 256  # levels in memory at a time when their density changes; 300 MB of size l
+ROWS = 100_000  # rows per sealed fragment, roughly; more: fewer files, but more to rewrite when levels are added
+CONVERTED = 256  # levels in memory at a time when their density changes: 300 MB for size l
 CROWD = 1_000  # unsealed neighbours that are merged even if they have fewer rows: many small files are slow to read
 
 
@@ -250,8 +250,8 @@ def convert(
     """Write trajectories in another density, at most CONVERTED to a new shard, durably.
 
     Args:
-        places: of the trajectories, which have one size and one set of rules.
-        density: of the new shards.
+        places: shards and rows of the trajectories, which have one size and one set of rules.
+        density: density of the new shards.
         key_every: env steps between key frames of `witness`.
         another: returns the path of the next new shard.
 

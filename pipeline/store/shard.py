@@ -35,7 +35,6 @@ from levelproof.pipeline.store.density import Restored, kept, needed, restored
 from levelproof.pipeline.store.disk import flush
 from levelproof.pipeline.store.fields import same_bits
 from levelproof.pipeline.store.formats import FLAT, SHARD_VERSION, Encoding, FieldSpec, field_table
-from levelproof.pipeline.store.layout import data_path
 from levelproof.pipeline.store.packing import empty, pack, unpack
 from levelproof.pipeline.store.remote import at_once, is_remote, mended, stored_in
 
@@ -116,7 +115,7 @@ class Shard:
         """Open the group at `path`, whose levels must have `size`, if given.
 
         Raises:
-            Failure: it is missing, damaged, not a shard of that size or any size, or has another version.
+            Failure: it is missing, damaged, not a shard, of another size, or of another version.
         """
         self.path = path = Path(path)
         try:
@@ -163,7 +162,15 @@ class Shard:
         Raises:
             Failure: as `read`.
         """
-        return _read_alike([(self, rows)], table_for(self.size), [range(len(rows))]).unlike
+        return self.restore([(self, rows)], table_for(self.size), [range(len(rows))]).unlike
+
+    def restore(self, parts: Sequence["Part"], table: Sequence[FieldSpec], places: Sequence[Sequence[int]]) -> Restored:
+        """Read rows of shards of this one's kind and encoding, level axis first; `places` are theirs in the result.
+
+        Raises:
+            Failure: as `read`.
+        """
+        return _read_alike(parts, table, places)
 
     def put(self, rows: Sequence[int], packed: Mapping[str, np.ndarray], places: Sequence[int]) -> None:
         """Decode the chunks of `rows` into packed arrays, at the positions `places`.
@@ -210,13 +217,13 @@ def read_together(
         by_encoding.setdefault(shard.encoding, []).append(i)
     places = _one_after_another(parts) if places is None else places
     if len(by_encoding) == 1:
-        found = _read_alike(parts, table, places)
+        found = parts[0][0].restore(parts, table, places)
         _report(parts, places, found.unlike, exactly)
         return found.arrays
     alone = []
     for alike in by_encoding.values():
         mine = [parts[i] for i in alike]
-        alone.append(_read_alike(mine, table, _one_after_another(mine)))
+        alone.append(mine[0][0].restore(mine, table, _one_after_another(mine)))
         _report(mine, _one_after_another(mine), alone[-1].unlike, exactly)
     back = np.argsort(np.concatenate([places[i] for alike in by_encoding.values() for i in alike]))
     return {name: np.concatenate([found.arrays[name] for found in alone])[back] for name in alone[0].arrays}
@@ -292,15 +299,6 @@ def damaged(shard: Path, error: Exception) -> Failure:
         f"The shard {shard} is missing or damaged ({reason}): "
         + mended(shard, f"run `levelproof verify {shard.parent.parent} --repair` to regenerate its levels.")
     )
-
-
-def open_shard(split: Path, name: str, size: str) -> Shard:
-    """Open the shard that a row of `split`'s manifest names, whose levels must have `size`.
-
-    Raises:
-        Failure: it is missing, damaged, of another size, or not in the split.
-    """
-    return Shard(data_path(split, name), size)
 
 
 def stored_bytes(path: Path) -> int:

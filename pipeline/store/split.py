@@ -15,6 +15,8 @@ from levelproof.pipeline.store.locks import committing, only_writer
 from levelproof.pipeline.store.manifest import Manifest, changes_text, differences
 from levelproof.pipeline.store.objects import require_conditions
 from levelproof.pipeline.store.remote import is_remote
+from levelproof.pipeline.store.scratch import written_disk
+from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.urls import require_known
 
 
@@ -24,7 +26,7 @@ def writing(job: JobConfig, say: Callable[[str], None], split: Path | None = Non
 
     Args:
         job: configuration to match.
-        say: prints what takes long or was left alone.
+        say: prints why the command waits, and which files it left in place.
         split: path (default: the job's own).
 
     Raises:
@@ -71,9 +73,11 @@ def locked(split: Path, say: Callable[[str], None]) -> Iterator[None]:
         Failure: a write in the block fails.
         StoreFailure, LeaseLost: its store does not answer, or another writer has taken over.
     """
+    if is_seed(split):
+        raise UserError(f"{split} has seed files, which no command changes: make a split of them, `levelproof grow`.")
     if is_remote(split):
         require_conditions(split / f".{JOB}.{secrets.randbits(60)}")
-        with only_writer(split, say):
+        with explaining_writes(written_disk(split)), only_writer(split, say):
             yield
         return
     _make_writable(split)

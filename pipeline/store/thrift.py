@@ -1,4 +1,4 @@
-"""Parser for the numbers in parquet's footer and page headers, to check them before a library that trusts them.
+"""Parser for the numbers in parquet's footer and page headers, to check them before a library trusts them.
 
 Both are structs of Thrift's compact protocol: for each field a byte with the difference to the last field's number and
 its type, then its value; a zero byte ends the struct. Numbers are zigzag varints; a list is a byte with its length and
@@ -19,7 +19,7 @@ GROUP: Fields = {1: [{3: COLUMN}], 3: I64}
 FOOTER: Fields = {3: I64, 4: [GROUP], 6: TEXT}
 PAGE: Fields = {1: I32, 2: I32, 3: I32, 5: {1: I32, 2: I32}, 7: {1: I32, 2: I32}}
 PLAIN = 0  # encoding: values one after another
-COUNTED = {0: 5, 2: 7}  # by kind of page (data, dictionary): field of the header that counts values
+COUNTED = {0: 5, 2: 7}  # field of a page header that counts values, by kind of page (data, dictionary)
 
 
 class Column(NamedTuple):
@@ -56,7 +56,7 @@ class Page(NamedTuple):
 
 
 def footer_in(data: bytes) -> Footer:
-    """Parse a footer. Raises ValueError or LookupError if Arrow never writes such a one."""
+    """Parse a footer. Raises ValueError or LookupError if Arrow never writes one like it."""
     fields, _ = _struct(data, 0, FOOTER)
     groups = [Group(group[3], [_column(column[3]) for column in group[1]]) for group in fields[4]]
     return Footer(fields[3], groups, fields[6].decode())

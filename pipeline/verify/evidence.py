@@ -21,16 +21,19 @@ from levelproof.experts.verdict.before import decide
 from levelproof.experts.witness.witness import Record, replay, steps_to_goal, succeeds
 from levelproof.levelgen.batching import LANES
 from levelproof.levelgen.identity.content import content_hashes, level_id_for
+from levelproof.levelgen.identity.keys import SAMPLER_VERSION
 from levelproof.levelgen.identity.signature import signatures
 from levelproof.levelgen.level import Level, size_of
 from levelproof.levelgen.sampling.sampler import Distribution, sample_levels
 from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.levelgen.task.rules import TaskParams
+from levelproof.physics.step import ENGINE_VERSION
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.read.level_files import level_at
 from levelproof.pipeline.read.rows import COLUMNS as POSITION_COLUMNS
 from levelproof.pipeline.read.rows import gather_rows
 from levelproof.pipeline.store.fields import arrays_of, same_bits, tree_of, unlike_fields
+from levelproof.pipeline.store.formats import FIRST_VERSION
 from levelproof.pipeline.store.origins import RECORD, origin_of
 from levelproof.pipeline.store.provenance import device, versions
 from levelproof.pipeline.store.shard import EngineDiffers, Shard
@@ -39,7 +42,7 @@ from levelproof.pipeline.verify.findings import Findings
 COLUMNS = (
     "label", "label_reason", "failed_by_noop", "content_hash", "signature", "file", "size", "steps_to_goal", "shard",
     "row", "experts", "budget",
-    "versions", "device",
+    "versions", "engine", "device",
 )  # fmt: skip
 
 Mask = Bool[np.ndarray, " level"]
@@ -74,7 +77,7 @@ class Evidence:
             name: rows.column(name).to_pylist() for name in COLUMNS if name != "versions"
         }
         self._positions = rows.select(POSITION_COLUMNS)
-        self.same_stack = same_stack(rows)
+        self.portable, self.same_stack = portable(rows), same_stack(rows)
         self.reported = np.zeros(len(self.ids), bool)
 
     def examine(self) -> None:
@@ -152,7 +155,7 @@ class Evidence:
     def _check_identities(self, levels: Level) -> Mask:
         """Check that rows describe the levels that their ids make; return which ones match in every bit.
 
-        A row that was made on another stack needs only a matching signature.
+        A row made by another sampler or engine, or not on a CPU, needs only a matching signature.
         """
         rows = list(zip(self.columns["content_hash"], self.columns["signature"], strict=True))
         ours = list(zip(content_hashes(levels), signatures(levels), strict=True))
@@ -162,7 +165,7 @@ class Evidence:
             same &= np.array(own) | [RECORD.fullmatch(file or "") is not None for file in self.columns["file"]]
         near = np.array([bool(set(a[1]) & set(b[1])) for a, b in zip(rows, ours, strict=True)])
         self._report(
-            ~np.where(self.same_stack, same, near),
+            ~np.where(self.portable, same, near),
             lambda _: (
                 "has a content hash or a signature that differs from the level that its id makes"
                 if self.recipe.distribution
@@ -190,11 +193,9 @@ class Evidence:
         unlike, restored_otherwise = np.isin(np.arange(len(lanes)), list(differs)), self._restores_otherwise(lanes)
         self.findings.same_bits += int((~unlike & ~restored_otherwise).sum())
         report = partial(self._report, lanes=lanes)
+        report(unlike & self.portable[lanes], lambda i: f"has a witness that does not replay: its {differs[i]} differs")
         report(
-            unlike & self.same_stack[lanes], lambda i: f"has a witness that does not replay: its {differs[i]} differs"
-        )
-        report(
-            restored_otherwise & self.same_stack[lanes],
+            restored_otherwise & self.portable[lanes],
             lambda _: "has states that differ from its shard's checksums or key frames",
         )
         report(~succeeds(done, replayed.goal), lambda _: "has a witness that does not reach the goal when replayed")
@@ -218,7 +219,7 @@ class Evidence:
 
     def _read_stored(self, lanes: Lanes, fields: Iterable[str] | None) -> dict[str, np.ndarray]:
         """Read arrays of levels, level axis last. Raise Failure if a shard is damaged."""
-        opened: dict[str, Any] = self.shards  # none is None: `_check_positions` excludes levels of unusable shards
+        opened: dict[str, Any] = self.shards  # never None here: `_check_positions` excludes levels of unusable shards
         arrays = gather_rows(self.recipe.split, self._positions.take(lanes), fields, lambda _, name, __: opened[name])
         return {name: np.moveaxis(x, 0, -1) for name, x in arrays.items()}
 
@@ -233,7 +234,7 @@ class Evidence:
         return None
 
     def _restores_otherwise(self, lanes: Lanes) -> Mask:
-        """Return for which levels this machine recomputes unstored states differently than their shard's maker."""
+        """Return which levels have unstored states that this machine recomputes with other bits than their maker."""
         wrong = np.zeros(len(lanes), bool)
         names = np.array(self.columns["shard"], object)[lanes]
         for name in dict.fromkeys(names):
@@ -246,7 +247,7 @@ class Evidence:
         """Check stored worlds against those in `levels`, which ids made, and replace them."""
         ours = arrays_of(levels)
         same = np.array([same_bits(x, ours[name][..., lanes]) for name, x in arrays_of(stored).items()]).all(0)
-        wrong = ~same & self.same_stack[lanes]
+        wrong = ~same & self.portable[lanes]
         self._report(wrong, lambda _: "has a world in its shard that differs from the one its id makes", lanes)
         if not same.all():
             hashes = content_hashes(stored)
@@ -256,7 +257,7 @@ class Evidence:
             ours[name][..., lanes] = values
 
     def _check_labels(self, levels: Level, known: Mask) -> None:
-        """Check labels that need no expert, for levels of which every bit is known."""
+        """Check labels that need no expert, for levels whose every bit is `known`."""
         verdicts, failed = decide(levels, self.recipe.rules)
         labels, reasons = self.columns["label"], self.columns["label_reason"]
         rows = list(zip(verdicts, labels, reasons, strict=True))
@@ -273,8 +274,24 @@ class Evidence:
         )
 
 
+def portable(rows: pa.Table) -> Mask:
+    """Return which rows' worlds and records this machine must reproduce bit for bit.
+
+    They are those that this sampler and engine made on a CPU, if this machine also computes on one, of any kind; and
+    those of the same stack.
+    """
+    made_with = rows.column("versions").combine_chunks()
+    sampler = made_with.field("sampler").to_numpy(zero_copy_only=False) == SAMPLER_VERSION
+    on_cpu = np.array([name.startswith("cpu:") for name in rows.column("device").to_pylist()], bool)
+    return same_stack(rows) | (sampler & _same_engine(rows) & on_cpu & device().startswith("cpu:"))
+
+
 def same_stack(rows: pa.Table) -> Mask:
-    """Return which rows were made with the same versions and device as here, so that bits must match."""
+    """Return which rows were made with the same versions and device as here, so that training repeats bit for bit."""
     made_with = rows.column("versions").combine_chunks()
     same = [made_with.field(name).to_numpy(zero_copy_only=False) == value for name, value in versions().items()]
-    return np.logical_and.reduce([*same, rows.column("device").to_numpy() == device()])
+    return np.logical_and.reduce([*same, _same_engine(rows), rows.column("device").to_numpy() == device()])
+
+
+def _same_engine(rows: pa.Table) -> Mask:
+    return rows.column("engine").fill_null(FIRST_VERSION).to_numpy() == ENGINE_VERSION

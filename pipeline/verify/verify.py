@@ -1,8 +1,9 @@
 """Verification of a split: compares every byte with its checksum, regenerates every level from its id or file,
 recomputes every label that needs no expert, and replays every witness.
 
-Bits must match on the stack (versions and device) that made a row. On another stack a level must match the signature of
-the one that its id makes, its world must match its row's content hash, and its witness must reach the goal.
+Worlds and records must match in every bit if this sampler and engine made them on any CPU, or if the same stack
+(versions and device) made them. Otherwise a level must match the signature of the one that its id makes, its world
+must match its row's content hash, and its witness must reach the goal.
 """
 
 import json
@@ -21,7 +22,7 @@ from rich.console import Console
 from levelproof.configs.convert import typed
 from levelproof.configs.errors import ConfigError
 from levelproof.configs.schema import from_files
-from levelproof.levelgen.identity.keys import SAMPLER_VERSION
+from levelproof.levelgen.identity.keys import ALIKE_VERSIONS, SAMPLER_VERSION
 from levelproof.levelgen.level import size_of
 from levelproof.levelgen.sampling.sampler import CHUNK, Distribution
 from levelproof.levelgen.task.rules import TaskParams
@@ -55,15 +56,18 @@ from levelproof.pipeline.store.manifest import (
     read_fragment,
     require_manifest,
 )
+from levelproof.pipeline.store.named import open_shard
 from levelproof.pipeline.store.origins import origin_of
 from levelproof.pipeline.store.remote import is_remote
 from levelproof.pipeline.store.runs import runs, runs_text, without
-from levelproof.pipeline.store.shard import Shard, open_shard
+from levelproof.pipeline.store.seed.file import is_seed
+from levelproof.pipeline.store.shard import Shard
 from levelproof.pipeline.verify.evidence import COLUMNS, Evidence, Recipe, same_stack
 from levelproof.pipeline.verify.findings import Findings
+from levelproof.pipeline.verify.seeds import examine_seeds
 
 GROUP_ROWS = 4 * CHUNK  # minimum number of rows per group of fragments
-ATTEMPTS = 3  # if fragments are sealed concurrently
+ATTEMPTS = 3  # maximum number of examinations, if fragments are sealed concurrently
 
 Part = tuple[Fragment, pa.Table]  # a fragment and its rows
 
@@ -80,7 +84,7 @@ def verify(split: Path, as_json: bool, console: Console) -> Exit:
         print(json.dumps(findings.as_json(), indent=2))
     else:
         print(findings.report(split))
-        if findings.wrong and not is_remote(split):
+        if findings.wrong and not is_remote(split) and not is_seed(split):
             print(f"Next:  levelproof verify {shlex.quote(str(split))} --repair")
     return Exit.FAILED if findings.wrong else Exit.DONE
 
@@ -92,6 +96,8 @@ def examine(split: Path, console: Console | None = None) -> Findings:
         UserError, Failure: as `verify`.
     """
     prepare_jax()
+    if is_seed(split):
+        return examine_seeds(split, console)
     for _ in range(ATTEMPTS - 1):
         before = _inodes(split)
         findings = _examine_once(split, console)
@@ -185,7 +191,7 @@ def _recipe(split: Path, fragment: Fragment, findings: Findings) -> Recipe:
     """Return how to make and play the levels. Raise Failure if this version cannot."""
     findings.config = config = fragment.config
     with recorded_settings(split):
-        if config["sampler_version"] != SAMPLER_VERSION:
+        if config["sampler_version"] not in ALIKE_VERSIONS:  # others are compared by signature
             raise ConfigError(f"sampler version {config['sampler_version']}, here it is {SAMPLER_VERSION}")
         size_of(config["size"])
         rules = typed(TaskParams, config["task"], "task")

@@ -30,7 +30,7 @@ from levelproof.levelgen.task.rules import TaskParams
 def test_compose_job_without_overrides_returns_the_small_default_dataset() -> None:
     job = compose_job([])
     assert (job.size, job.level_ids, job.env_steps, job.budget, job.out) == ("s", range(64), 128_000, "128k", "data")
-    assert (job.executor, job.workers) == ("ray", 0)
+    assert (job.executor, job.workers) == ("auto", 0)
 
 
 def test_compose_job_takes_defaults_from_the_dataclasses() -> None:

@@ -70,4 +70,4 @@ def test_setting_text_lists_choices_that_the_meaning_lacks() -> None:
     text = {setting.name: setting.text for setting in SETTINGS}
     assert "flat: all features in one vector; entity: " in text["expert.network"]
     assert text["procedure"].endswith("(default, label, masters, published)")
-    assert "(ray, inline)" not in text["executor"]
+    assert "(auto, ray, inline)" not in text["executor"]

@@ -7,9 +7,6 @@ import pytest
 from jaxtyping import Array, Int
 
 from levelproof.experts.config import RECORD_STEPS
-from levelproof.experts.labels import Source
-from levelproof.experts.pool import run
-from levelproof.experts.pool.found import LevelSearch
 from levelproof.experts.search.search import Searching
 from levelproof.experts.witness.success import Success, ending_at
 from levelproof.levelgen.batching import repeat
@@ -20,7 +17,7 @@ from levelproof.levelgen.task.actions import CHOICES, action_mask
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 
 LANES = 64  # per level
-REDRAWN = (0.02, 0.05, 0.1, 0.3)  # probability of redrawing an entry of the action, for a quarter of the lanes each
+REDRAWN = (0.02, 0.05, 0.1, 0.3)  # probability of resampling an entry of the action, each in a quarter of the lanes
 
 
 def random_successes(levels: Level, level_ids: Int[np.ndarray, " level"]) -> Success:
@@ -30,14 +27,8 @@ def random_successes(levels: Level, level_ids: Int[np.ndarray, " level"]) -> Suc
 
 def searched_randomly(monkeypatch: pytest.MonkeyPatch) -> None:
     """Make random play stand in for the search of a `TrainingRun` whose procedure has none."""
-
-    def found(levels: Level, level_ids: Int[np.ndarray, " level"], searching: Searching) -> LevelSearch:
-        looking = LevelSearch(levels, level_ids, searching)
-        source = [Source.SCOUT] * len(level_ids)
-        looking.found = looking.found._replace(success=random_successes(levels, level_ids), source=source)
-        return looking
-
-    monkeypatch.setattr(run, "LevelSearch", found)
+    played = lambda _, job: job.known._replace(success=random_successes(job.levels, job.level_ids))
+    monkeypatch.setattr(Searching, "result", played)
 
 
 @jax.jit

@@ -18,5 +18,5 @@ WHOLE = StopConfig(rule=Rule.BUDGET)
 
 
 def untouched(stopping: StopConfig, config: ExpertConfig = CONFIG) -> Procedure:
-    """Procedure without a search."""
+    """Return a procedure without a search."""
     return Procedure(SearchConfig(env_steps=0), config, stopping)

@@ -1,4 +1,4 @@
-"""First episodes on levels: against a plain loop, in other batches, and by baselines."""
+"""First episodes equal a plain loop, do not depend on batches, and follow their player's rule."""
 
 from functools import partial
 
@@ -20,6 +20,7 @@ from levelproof.experts.evaluation import (
     play_sticky,
 )
 from levelproof.experts.networks.over_levels import NetworkConfig, initial_policy
+from levelproof.experts.witness.witness import replay
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
@@ -45,7 +46,7 @@ def test_attempts_equal_a_plain_loop(levels: Level, played: evaluation.FirstEpis
     step = jax.jit(partial(task.advance, params=DEFAULT_RULES))
     for number, attempt in ((0, 0), (5, 2), (11, 1)):
         level = take(levels, np.array([number]))
-        key = evaluation._keys(jnp.array([IDS[number]]), jnp.uint32(1), ATTEMPTS)[attempt]
+        key = evaluation._keys(jnp.array([IDS[number]]), jnp.uint32(1), jnp.arange(ATTEMPTS))[attempt]
         now, steps, goal = task.reset(level), 0, False
         while steps < RECORD_STEPS:
             uniform = jax.random.uniform(jax.random.fold_in(key, steps), (6,))
@@ -65,6 +66,19 @@ def test_batches_change_no_result(levels: Level, played: evaluation.FirstEpisode
     np.testing.assert_array_equal(other.env_steps, played.env_steps[order])
 
 
+def test_batches_hold_at_most_their_lanes(
+    levels: Level, played: evaluation.FirstEpisodes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More attempts than lanes are played in rounds, with the same results."""
+    programs = []
+    program_of = evaluation._program
+    monkeypatch.setattr(evaluation, "_program", lambda *given: programs.append(given[1]) or program_of(*given))
+    two = play(play_randomly, (), levels, IDS, ATTEMPTS, 1, DEFAULT_RULES, lanes=2)
+    assert programs == [2]
+    np.testing.assert_array_equal(two.solved, played.solved)
+    np.testing.assert_array_equal(two.env_steps, played.env_steps)
+
+
 def test_more_attempts_keep_the_first_ones(levels: Level, played: evaluation.FirstEpisodes) -> None:
     more = play(play_randomly, (), levels, IDS, ATTEMPTS + 2, 1, DEFAULT_RULES)
     np.testing.assert_array_equal(more.solved[:, :ATTEMPTS], played.solved)
@@ -73,8 +87,8 @@ def test_more_attempts_keep_the_first_ones(levels: Level, played: evaluation.Fir
 
 
 def test_stored_actions_solve_their_level(levels: Level, played: evaluation.FirstEpisodes) -> None:
-    """A player that repeats the actions of random play's first attempts solves as much, in as many steps."""
-    keys = evaluation._keys(jnp.array(IDS), jnp.uint32(1), ATTEMPTS)[::ATTEMPTS]
+    """A player that repeats the actions of random play's first attempts solves the same levels, in as many steps."""
+    keys = evaluation._keys(jnp.array(IDS), jnp.uint32(1), jnp.arange(ATTEMPTS))[::ATTEMPTS]
     draw = lambda key, step: jax.random.uniform(jax.random.fold_in(key, step), (6,))
     uniform = jax.vmap(jax.vmap(draw, (0, None), -1), (None, 0))(keys, jnp.arange(RECORD_STEPS))
     actions = np.floor(np.asarray(uniform) * np.array(CHOICES)[:, None]).astype(np.int32)
@@ -84,6 +98,14 @@ def test_stored_actions_solve_their_level(levels: Level, played: evaluation.Firs
     np.testing.assert_array_equal(again.env_steps[:, 0], played.env_steps[:, 0])
     still = play(do_nothing, (), levels, IDS, 1, 0, DEFAULT_RULES)
     assert (again.solved & ~still.solved).any()  # the actions matter
+
+
+def test_first_actions_are_those_of_the_first_attempts(levels: Level, played: evaluation.FirstEpisodes) -> None:
+    actions = evaluation.first_actions(play_randomly, (), levels, IDS, 1, DEFAULT_RULES)
+    record = replay(levels, actions)
+    ends = np.argmax(record.done, 0)
+    np.testing.assert_array_equal(record.goal[ends, np.arange(len(IDS))], played.solved[:, 0])
+    np.testing.assert_array_equal(ends[record.done.any(0)] + 1, played.env_steps[record.done.any(0), 0])
 
 
 def test_players_draw_as_they_say(levels: Level) -> None:

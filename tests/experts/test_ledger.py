@@ -14,11 +14,11 @@ def test_lap_separates_compiling_from_work() -> None:
     inner = jax.jit(lambda x: jnp.sin(x) @ jnp.cos(x))  # traced within the other
     program = jax.jit(lambda x: inner(x) + inner(x.T))
     matrix = np.ones((64, 64), np.float32)
-    begun = time.perf_counter()
+    start = time.perf_counter()
     with lap() as first:
         jax.block_until_ready(program(matrix))
         time.sleep(0.05)
-    whole = time.perf_counter() - begun
+    whole = time.perf_counter() - start
     with lap() as second:
         jax.block_until_ready(program(matrix))
     assert 0 < first.compiling < whole - 0.05

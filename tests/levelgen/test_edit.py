@@ -90,7 +90,7 @@ def test_delete_removes_a_body_with_its_joints_and_thrusters() -> None:
     assert one.model.collides[FIRST, M.polygons]
 
 
-def test_set_role_fix_and_bodies_at() -> None:
+def test_set_role_and_fix_change_one_body() -> None:
     level = fix(set_role(joined(), FIRST, Role.GREEN), FIRST, True)
     one = one_of(level)
     assert one.role[FIRST] == Role.GREEN
@@ -115,6 +115,14 @@ def test_impossible_edit_raises_one_sentence(edit, words: str) -> None:
     with pytest.raises(EditError, match=words) as error:
         edit()
     assert str(error.value).endswith(".")
+
+
+def test_reach_of_a_polygon_is_that_of_its_corners() -> None:
+    """A square of 3.6 m has corners 2.55 m from its centre, and sides 1.8 m from it."""
+    level = add_body(empty(), "rectangle", 2.0, 2.0)
+    half = np.abs(one_of(level).model.vertices[FIRST]).max()
+    with pytest.raises(EditError, match=r"would reach 2\.5"):
+        resize(level, FIRST, 1.8 / half)
 
 
 number = st.floats(-1, 6)

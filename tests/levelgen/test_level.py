@@ -19,7 +19,7 @@ def test_size_of_reads_name_of(size: Size) -> None:
     assert size_of(name_of(size)) == size
 
 
-def test_names() -> None:
+def test_sizes_have_their_canonical_names() -> None:
     assert {name: size_of(name) for name in SIZES} == SIZES
     assert size_of("8-7-6-5") == Size(polygons=8, circles=7, joints=6, thrusters=5)
     assert name_of(Size(12, 4, 6, 2)) == "l"

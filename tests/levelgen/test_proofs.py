@@ -87,9 +87,9 @@ def changed(level: Level, **model: Any) -> Level:
 
 
 def play(level: Level, key, sticky, rules: TaskParams = DEFAULT_RULES, steps: int = ENV_STEPS, choices=CHOICES):
-    """(done, goal, reward), each [step, lane]: random actions that repeat with probability `sticky` [lane].
+    """Play random actions that repeat with probability `sticky` [lane]; return (done, goal, reward), each [step, lane].
 
-    `choices` [action] is how many of each there are; with one, it does nothing.
+    `choices` [entry] is the number of choices of each entry of an action; an entry with one choice does nothing.
     """
     return _play(level, key, sticky, np.asarray(choices)[:, None], rules, steps)  # traced: one program serves all
 

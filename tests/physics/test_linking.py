@@ -10,6 +10,7 @@ import pytest
 from llvmlite import binding
 
 from levelproof.physics import step as step_module
+from levelproof.physics.codegen import call as call_module
 from levelproof.physics.codegen import compile as compile_module
 from levelproof.physics.step import step
 from tests.physics.codegen.kernels import same_bits
@@ -28,14 +29,14 @@ def after(seed: int = 1) -> list[Any]:
 def test_runtime_dyld_gives_the_bits_of_jitlink(monkeypatch: pytest.MonkeyPatch) -> None:
     by_jitlink = after()
     JIT.append(binding.create_lljit_compiler(use_jit_link=False))
-    marked = lambda request, make: make() + b"\n; for RuntimeDyld"  # another name: XLA accepts each only once
-    monkeypatch.setattr(step_module, "cached_by_sources", marked)
+    marked = lambda request, make, folders: make() + b"\n; for RuntimeDyld"  # another name: XLA accepts each only once
+    monkeypatch.setattr(call_module, "cached_by_sources", marked)
     monkeypatch.setattr(compile_module, "_jit", lambda: JIT[-1])
-    step_module._compiled.cache_clear()
+    step_module._compiled.forget()  # pyright: ignore[reportFunctionMemberAccess]
     before = len(compile_module._libraries)
     same_bits(by_jitlink, after())
     assert len(compile_module._libraries) == before + 1
-    step_module._compiled.cache_clear()
+    step_module._compiled.forget()  # pyright: ignore[reportFunctionMemberAccess]
 
 
 def test_kernels_are_linked_by_jitlink(monkeypatch: pytest.MonkeyPatch) -> None:

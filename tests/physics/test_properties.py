@@ -129,9 +129,9 @@ class TestMirror:
     @functools.cache
     def both(size: str, steps: int):
         world = golden(size)
-        here, seen = play(*world, steps)
-        there, seen_there = play(*mirror.of_world(*world), steps)
-        return here, seen, mirror.of_state(there), mirror.of_manifold(seen_there)
+        here, contacts = play(*world, steps)
+        there, contacts_there = play(*mirror.of_world(*world), steps)
+        return here, contacts, mirror.of_state(there), mirror.of_manifold(contacts_there)
 
     def off(self, size: str, steps: int) -> np.ndarray:
         """Return the largest difference of each symmetric lane."""
@@ -148,7 +148,7 @@ class TestMirror:
             np.testing.assert_allclose(a, b, atol=1e-6)
 
     @pytest.mark.parametrize("size", SIZES)
-    def test_one_step(self, size: str) -> None:
+    def test_one_step_keeps_mirror_symmetry(self, size: str) -> None:
         off = self.off(size, 1)
         assert np.median(off) < 1e-6
         assert (off < 1e-4).mean() >= 0.99
@@ -156,7 +156,7 @@ class TestMirror:
         assert off.max() < 1e-2
 
     @pytest.mark.parametrize("size", SIZES)
-    def test_contacts(self, size: str) -> None:
+    def test_contacts_keep_mirror_symmetry(self, size: str) -> None:
         _, here, _, there = self.both(size, 1)
         np.testing.assert_array_equal(here.active, there.active)
         for name in ("penetration", "point"):
@@ -175,7 +175,7 @@ class TestMirror:
 
     @pytest.mark.parametrize("size", SIZES)
     @pytest.mark.parametrize(("steps", "share"), [(8, 0.99), (30, 0.975), (60, 0.92)])
-    def test_many_steps(self, size: str, steps: int, share: float) -> None:
+    def test_many_steps_keep_mirror_symmetry_in_most_lanes(self, size: str, steps: int, share: float) -> None:
         """The other lanes are chaotic: rounding has grown to 1e-3."""
         assert (self.off(size, steps) < 1e-3).mean() >= share
 
@@ -184,7 +184,7 @@ class TestPrecision:
     """One step in single precision against the same source in double precision."""
 
     @pytest.mark.parametrize("size", ["s", *(pytest.param(size, marks=pytest.mark.campaign) for size in "ml")])
-    def test_one_step(self, size: str) -> None:
+    def test_single_precision_step_is_close_to_double(self, size: str) -> None:
         world = golden(size)
         single, _ = play(*world)
         with jax.enable_x64(True):

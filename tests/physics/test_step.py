@@ -105,7 +105,7 @@ class TestFreeFlight:
         motor, thrust = idle()
         after, _ = play(model, state, motor + 1, thrust)
         spins = after.angular_velocity[:, 0]
-        assert spins[BALL] > 0 > spins[BOX]  # forward: b turns counterclockwise against a
+        assert spins[BALL] > 0 > spins[BOX]  # forward: b turns counterclockwise relative to a
         angular = spins[[BOX, BALL]] / model.inverse_inertia[[BOX, BALL], 0]
         np.testing.assert_allclose(angular.sum(), 0, atol=1e-5)
         np.testing.assert_allclose(after.velocity[[BOX, BALL], :, 0], 0, atol=1e-5)
@@ -265,7 +265,7 @@ class TestLanes:
         """A step that returns no contacts leads to the same state."""
         sample = load(HERE / f"{size}.npz")
         given = sample.level.model, sample.state, sample.motor, sample.thrust
-        self.same_bits(host(jax.jit(lambda *given: step(*given, seen=False)[0])(*given)), play(*given)[0])
+        self.same_bits(host(jax.jit(lambda *given: step(*given, with_contacts=False)[0])(*given)), play(*given)[0])
 
     def test_step_broadcasts_one_model(self) -> None:
         """A model with one lane broadcasts over the lanes of its states."""

@@ -6,22 +6,22 @@ import sys
 
 from tests.golden.load import HERE
 
-# Starts with no kernel, neither in the process nor kept by another: compiling takes long enough for all threads to ask
-# for it meanwhile. The barrier lets them ask together
+# No kernel exists yet, neither in the process nor on disk. Compiling takes long enough for all threads to ask for the
+# kernel in the meantime; the barrier makes them ask together
 PROGRAM = """
 import threading
 import numpy as np
 from levelproof.physics.step import step
 from tests.physics.worlds import idle, room
-given, barrier, found = (*room(), *idle()), threading.Barrier(6), {}
+given, barrier, results = (*room(), *idle()), threading.Barrier(6), {}
 
 def first(thread):
     barrier.wait()
     try:
-        after = step(*given, seen=False)[0]
-        found[thread] = np.asarray(after.position).tobytes()
+        after = step(*given, with_contacts=False)[0]
+        results[thread] = np.asarray(after.position).tobytes()
     except Exception as error:
-        found[thread] = repr(error)
+        results[thread] = repr(error)
 
 threads = [threading.Thread(target=first, args=[thread]) for thread in range(6)]
 for thread in threads:
@@ -29,8 +29,8 @@ for thread in threads:
 for thread in threads:
     thread.join()
 for thread in range(6):
-    assert isinstance(found[thread], bytes), found[thread]
-assert len(set(found.values())) == 1
+    assert isinstance(results[thread], bytes), results[thread]
+assert len(set(results.values())) == 1
 """
 
 

@@ -1,4 +1,4 @@
-"""Sine, cosine and hyperbolic tangent against numpy's in double precision, as machine code and by XLA."""
+"""Sine, cosine, angles and hyperbolic tangent against numpy's in double precision, as machine code and by XLA."""
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from levelproof.physics.codegen.buffers import LANES, Buffer
-from levelproof.physics.trigonometry import cos_sin, tanh
+from levelproof.physics.trigonometry import angle_of, cos_sin, tanh
 from tests.physics.codegen.kernels import Kernel
 
 COUNT = 4096 * LANES
@@ -46,7 +46,7 @@ class TestCosSin:
     @pytest.mark.parametrize(
         ("largest", "error"), [(np.pi / 4, 1e-7), (10.0, 1e-7), (100.0, 1e-7), (8192.0, 1e-7), (1e5, 1e-6)]
     )
-    def test_error(self, way, largest: float, error: float) -> None:
+    def test_error_is_bounded(self, way, largest: float, error: float) -> None:
         """1e-7 is 1.7 units in the last place of 1."""
         x = np.random.default_rng(1).uniform(-largest, largest, COUNT).astype(np.float32)
         cos, sin, _ = way(x)
@@ -54,7 +54,7 @@ class TestCosSin:
         np.testing.assert_allclose(sin, np.sin(x.astype(float)), rtol=0, atol=error)
 
     @ways
-    def test_units_in_the_last_place(self, way) -> None:
+    def test_error_in_units_in_the_last_place_is_bounded(self, way) -> None:
         """Two where the result is not small; more at its zeros, for lack of digits of pi in QUARTER_PARTS."""
         x = np.random.default_rng(2).uniform(-2 * np.pi, 2 * np.pi, COUNT).astype(np.float32)
         cos, sin, _ = way(x)
@@ -65,7 +65,7 @@ class TestCosSin:
 
     @ways
     @pytest.mark.parametrize("step", [np.pi / 4, np.pi / 2])
-    def test_error_at_quadrant_borders(self, way, step: float) -> None:
+    def test_error_at_quadrant_borders_is_bounded(self, way, step: float) -> None:
         """At and beside every multiple of an eighth of a turn, where the quadrant may be rounded either way."""
         nearest = (np.arange(-8191, 8192) * step).astype(np.float32)
         beside = [np.nextafter(nearest, np.float32(towards)) for towards in (-np.inf, np.inf)]
@@ -96,9 +96,29 @@ class TestCosSin:
             assert max(np.abs(cos[finite]).max(initial=0), np.abs(sin[finite]).max(initial=0)) <= 1
 
 
+ANGLE = Kernel(lambda v, out: out.__setitem__(0, angle_of(v[0], v[1])), [Buffer((2,))], [Buffer((1,))])
+angles = pytest.mark.parametrize("way", [lambda v: ANGLE.as_machine_code(v)[0][0], lambda v: np.asarray(angle_of(*v))])
+
+
+class TestAngle:
+    @angles
+    def test_error_in_units_in_the_last_place_is_bounded(self, way) -> None:
+        random = np.random.default_rng(5)
+        x, y = (random.normal(size=COUNT) * np.exp(random.normal(0, 4, COUNT)) for _ in range(2))
+        v = np.float32([x, y])
+        assert units(way(v), np.arctan2(*v[::-1].astype(float))).max() < 4
+
+    @angles
+    def test_multiples_of_an_eighth_turn_are_exact_up_to_rounding(self, way) -> None:
+        v = np.zeros((2, LANES), np.float32)
+        v[:, :8] = [1, 1, 0, -1, -1, -1, 0, 1], [0, 1, 1, 1, 0, -1, -1, -1]
+        eighths = np.array([0, 1, 2, 3, 4, -3, -2, -1] + [0] * (LANES - 8))
+        np.testing.assert_allclose(way(v), eighths * np.pi / 4, rtol=2e-7)
+
+
 class TestTanh:
     @ways
-    def test_units_in_the_last_place(self, way) -> None:
+    def test_error_in_units_in_the_last_place_is_bounded(self, way) -> None:
         small = np.geomspace(1e-30, 1e-3, COUNT // 2)
         x = np.concatenate([small * np.tile([1, -1], COUNT // 4), np.linspace(-10, 10, COUNT // 2)]).astype(np.float32)
         ours, exact = way(x)[2], np.tanh(x.astype(float))

@@ -69,7 +69,7 @@ def room(lanes: int = LANES, gravity: float = -9.81) -> tuple[Model, State]:
 
 
 def changed(tree, **rows):
-    """`tree` with `name={index: value}` written into its fields, in all lanes.
+    """Return `tree` with `name={index: value}` written into its fields, in all lanes.
 
     >>> changed(state, velocity={BOX: (1.0, 0.0)})
     """

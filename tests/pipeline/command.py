@@ -15,7 +15,7 @@ from levelproof.pipeline.cli.main import main
 from tests.pace import patience, wait_until
 
 ROOT = Path(__file__).parents[2]
-COMMAND_SECONDS = 600  # limit of a whole command; workers are niced, so they wait for any other load
+COMMAND_SECONDS = 600  # limit of a whole command
 TINY = ("levels=4", "unit=1", "budget=5k")  # four real units with two updates each
 
 T = TypeVar("T")
@@ -27,7 +27,7 @@ def start(
     """Start the command in its own process group, so that Ctrl-C can be sent to the whole group, as a terminal does.
 
     Args:
-        arguments: of the command.
+        arguments: command-line arguments.
         cwd: working folder.
         address: RAY_ADDRESS; empty: unset.
         module: program to run instead of the command.
@@ -73,14 +73,18 @@ def heed_ctrl_c() -> None:
 
 
 def until(condition: Callable[[], T], process: subprocess.Popen[str]) -> T:
-    """Wait until the condition holds, and return its value; fail if the process ends before."""
+    """Wait until the condition holds, and return its value; if it never does, fail with the process's output."""
 
     def value() -> T:
         found = condition()
         assert found or process.poll() is None, f"the command ended early: {process.communicate()}"
         return found
 
-    return wait_until(value, COMMAND_SECONDS, process.args)
+    try:
+        return wait_until(value, COMMAND_SECONDS, process.args)
+    except AssertionError as error:
+        process.kill()
+        raise AssertionError(f"{error}; it wrote {process.communicate()}") from None
 
 
 def assert_refused(done: subprocess.CompletedProcess[str], code: int, *words: str) -> None:
@@ -122,7 +126,7 @@ def title(pid: int) -> str:
 
 
 def listening(pids: set[int]) -> dict[str, str]:
-    """Where these processes listen for others, as Linux has it in /proc/net: address, and the title of the process."""
+    """Return the addresses at which these processes listen, as in Linux's /proc/net, with each process's title."""
     sockets = {}
     for pid in pids:
         with contextlib.suppress(OSError):

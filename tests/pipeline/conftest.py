@@ -1,4 +1,4 @@
-"""A split to look at, which no test writes to; folders of tests may replace it by their own."""
+"""A split for tests that only read; a folder of tests may define its own."""
 
 from pathlib import Path
 

@@ -1,6 +1,6 @@
-"""The command `levelproof` with workers that die of a level: `python -m tests.pipeline.fragile LEVEL SECONDS ...`.
+"""The command `levelproof` with workers that one level kills: `python -m tests.pipeline.fragile LEVEL SECONDS ...`.
 
-If LEVEL is -1, they die before they have started. After SECONDS without a report they are given up.
+If LEVEL is -1, they die before they have started. The driver gives up a worker after SECONDS without a report.
 """
 
 import os

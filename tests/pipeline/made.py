@@ -128,14 +128,16 @@ def made_job(out: str = "data", *overrides: str) -> JobConfig:
     return compose_job([f"out={out}", "executor=inline", *overrides])
 
 
-def played_split(folder: Path, held: int = 16, size: str = "s") -> Path:
+def played_split(folder: Path, held: int = 16, size: str = "s", copies: Sequence[int] = ()) -> Path:
     """Make a real split in `folder`: levels under random actions, each held for `held` env steps.
 
-    Levels whose episode reaches the goal are labelled solved.
+    Levels whose episode reaches the goal are labelled solved. The first levels have the content of those with the ids
+    `copies`.
     """
     job = made_job(str(folder), f"size={size}", f"levels={PLAYED}")
     ids = np.arange(PLAYED, dtype=np.int32)
-    levels = jax.tree.map(np.asarray, sample_levels(jnp.asarray(ids), SIZES[size], job.distribution))
+    content = jnp.asarray([*copies, *ids[len(copies) :]])
+    levels = jax.tree.map(np.asarray, sample_levels(content, SIZES[size], job.distribution))
     rng = np.random.default_rng(0)
     action = np.repeat(rng.integers(0, 2, (RECORD_STEPS // held, 6, PLAYED)), held, axis=0).astype(np.int32)
     record = replay(levels, action, job.task)

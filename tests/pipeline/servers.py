@@ -48,7 +48,7 @@ Answers = Callable[[str, str, dict[str, str], bytes], Answer]  # gets a method, 
 
 
 class Server:
-    """Answers requests by a function, logs them, and spoils every n-th answer if asked to."""
+    """HTTP server that answers requests by a function, logs them, and spoils every n-th answer on request."""
 
     def __init__(self, answers: Answers) -> None:
         self.log: list[str] = []  # "GET /path bytes=0-99"
@@ -136,10 +136,10 @@ def serving_bucket(
     """Serve an empty bucket to this process, which has short time-outs and no cached metadata.
 
     Args:
-        patch: sets this process up.
-        folder: of the bucket and the cache.
-        seconds: limit for retries.
-        answers: of the server (default: those of `bucket_of`).
+        patch: changes this process's environment and settings.
+        folder: folder for the bucket and the cache.
+        seconds: limit for retries, s.
+        answers: function that answers requests (default: that of `bucket_of`).
     """
     patch.setenv("LEVELPROOF_CACHE_DIR", str(folder / "cache"))
     patch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=seconds))
@@ -352,7 +352,7 @@ def _accepts(port: int) -> bool:
 
 @contextmanager
 def _listening(words: Sequence[str], port: int, **environment: str) -> Iterator[None]:
-    """A process, from when it listens."""
+    """Run a process in the `with` block, which begins once the process listens on `port`."""
     process = subprocess.Popen(
         words, env=os.environ | environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )

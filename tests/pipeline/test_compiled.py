@@ -8,9 +8,8 @@ from levelproof.pipeline.runtime import LAST_CHECK, remove_damaged
 from tests.pipeline.test_runtime import python
 
 COMPILE = """
-from levelproof.pipeline import runtime
-runtime.MIN_COMPILE_SECONDS = 0
-runtime.prepare_jax()
+from levelproof.pipeline.runtime import prepare_jax
+prepare_jax()
 import warnings
 warnings.simplefilter("error")  # JAX warns of programs that it cannot read
 import jax

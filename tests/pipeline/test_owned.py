@@ -36,7 +36,7 @@ def test_generate_rejects_a_cache_that_others_can_write_to(
     cache.chmod(mode)
     monkeypatch.setenv(CACHE_VARIABLE, str(cache))
     done = here(["generate", "levels=1", "budget=5k", "out=data"], tmp_path)
-    assert_refused(done, 2, f"Other users can write to {cache}", f"{CACHE_VARIABLE} name a folder of your own")
+    assert_refused(done, 2, f"Other users can write to {cache}", f"{CACHE_VARIABLE} to a folder of your own")
     assert not (tmp_path / "data").exists()
 
 

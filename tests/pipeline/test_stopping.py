@@ -68,7 +68,7 @@ def test_second_signal_interrupts_a_heeded_block() -> None:
 def test_driver_cancels_rounds_to_stop(tmp_path: Path) -> None:
     """Otherwise a worker would learn of the stop only at the end of its round."""
     alone = ("search.env_steps=0", "stop.rule=budget")  # so that experts train long
-    command = ["generate", "levels=8", "unit=1", "budget=100M", "workers=1", *alone]
+    command = ["generate", "levels=8", "unit=1", "budget=100M", "workers=1", "executor=ray", *alone]
     process = start(command, tmp_path, module="tests.pipeline.long_rounds")
     busy = "ray::WorkerActor.work"
     until(lambda: any(title(pid).startswith(busy) for pid in descendants(process.pid)), process)

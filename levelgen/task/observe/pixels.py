@@ -66,7 +66,7 @@ class Coverage(NamedTuple):
 def pixels(level: Level, state: State) -> PixelsObservation:
     """Draw a state; neither level nor state has a lane axis."""
     height = jnp.arange(SIDE, dtype=jnp.float32)
-    # The barriers store intervals and image: XLA would recompute them for every pixel and colour.
+    # The barriers make XLA store intervals and image, which it would recompute for every pixel and colour.
     low, high, colour = jax.lax.optimization_barrier(jax.tree.map(lambda *x: jnp.stack(x), *_shapes(level, state)))
     image = jnp.full((SIDE, SIDE), _packed(np.array(BACKGROUND)))
     for shape in range(len(low)):
@@ -199,7 +199,7 @@ def _packed(colour: Any) -> Int[Array, " *colours"]:
 
 
 def _on_body(state: State, body: Int[Array, ""], anchor: Float[Array, "2"]) -> Float[Array, "2"]:
-    """Transform a point of a body's frame to pixels."""
+    """Transform a point from a body's frame to pixels."""
     return PIXELS_PER_METRE * (state.position[body] + _turn(anchor, state.rotation[body]))
 
 

@@ -2,7 +2,8 @@
 
 Data files are scripts that pass a value to the page, because pages opened from disk may load only scripts:
 `data/about.js` describes the split, `data/columns/` has pages of the manifest, `data/worlds/` the initial worlds of
-BLOCK levels per file, `data/levels/` a file per level with its row and its witness's motion.
+BLOCK levels per file, `data/levels/` a file per level with its row and its witness's motion, and that of a policy's
+attempt if one plays.
 """
 
 import json
@@ -10,7 +11,7 @@ import math
 import shlex
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +19,20 @@ import jax
 import numpy as np
 
 from levelproof.experts.witness.witness import steps_to_goal, succeeds
-from levelproof.levelgen.level import Level
+from levelproof.levelgen.level import Level, size_of
 from levelproof.levelgen.pictures.palette import palette_css
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.look import cost
 from levelproof.pipeline.look.entities import ENTITIES, count_entities
+from levelproof.pipeline.look.gallery.attempts import FAILS, SOLVES, Contender, PolicyAttempt
 from levelproof.pipeline.look.gallery.pages import NOTHING, PAGE, encode_columns, encode_page
 from levelproof.pipeline.look.gallery.worlds import drawn_bodies, encode_array, states_of, world_of
 from levelproof.pipeline.look.spread import spread
 from levelproof.pipeline.read.levels import levels_of, rules_of
+from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.bar import with_bar
 from levelproof.pipeline.store.created import new_folder
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
@@ -44,21 +48,33 @@ STATES = ("position", "rotation", "velocity", "angular_velocity")
 MOTION = (*(f"record/state/{name}" for name in STATES), "record/action", "record/done", "record/goal")
 
 
-def gallery(split: Path, out: Path, where: str | None, most: int) -> None:
+def gallery(split: Path, out: Path, where: str | None, most: int, policy: Path | None = None) -> None:
     """Write the site; print its path and how to open it.
 
+    Args:
+        split: path or URL of the split.
+        out: folder to write.
+        where: SQL condition that selects levels.
+        most: maximum number of levels.
+        policy: folder of a policy that plays beside the witnesses; None: none.
+
     Raises:
-        UserError: no split, no matching level, `out` exists and is not a gallery, or it cannot be written.
+        UserError: no split, no matching level, no usable policy, `out` exists and is not a gallery, or it cannot be
+            written.
         Failure: the split is damaged.
     """
     manifest, matching = _chosen(split, where, most)
     count = manifest.table.num_rows
+    contender = _contender(policy, manifest) if policy else None
     with new_folder(out, replaces=lambda folder: (folder / ABOUT).is_file()) as folder:
         shutil.copytree(SITE, folder, dirs_exist_ok=True)
         (folder / "palette.css").write_text(palette_css(), encoding="utf-8")
-        counted = [_write_block(folder, manifest, first) for first in with_bar(range(0, count, BLOCK), "levels")]
-        entities = {name: np.concatenate([counts[name] for counts in counted]) for name in ENTITIES}
-        about, values = encode_columns(manifest.table, entities | {"seconds": cost.seconds_of(manifest.table)})
+        blocks = with_bar(range(0, count, BLOCK), "levels")
+        written = [_write_block(folder, manifest, first, contender) for first in blocks]
+        entities = {name: np.concatenate([counts[name] for counts, _ in written]) for name in ENTITIES}
+        numbers = entities | {"seconds": cost.seconds_of(manifest.table)}
+        outcomes = {"policy": [outcome for _, some in written for outcome in some]} if contender else {}
+        about, values = encode_columns(manifest.table, numbers, outcomes)
         for page in range(math.ceil(count / PAGE)):
             _write(folder, f"columns/{page}", encode_page(values, page))
         _write(folder, "about", _about(manifest, matching, where, about))
@@ -72,7 +88,7 @@ def gallery(split: Path, out: Path, where: str | None, most: int) -> None:
 def _chosen(split: Path, where: str | None, most: int) -> tuple[Manifest, int]:
     """Read the rows to show; also return the number that match."""
     if most < 1:
-        raise UserError(f"levels is {most}: a gallery has at least one.")
+        raise UserError(f"--levels is {most}: a gallery needs at least 1.")
     everything = require_manifest(split, columns_in(where), compact=True)
     ids = select(everything.table, where).column("level_id").to_numpy()
     if not len(ids):
@@ -80,8 +96,17 @@ def _chosen(split: Path, where: str | None, most: int) -> tuple[Manifest, int]:
     return require_manifest(split, level_ids=ids[spread(len(ids), most)]), len(ids)
 
 
-def _write_block(folder: Path, manifest: Manifest, first: int) -> dict[str, np.ndarray]:
-    """Write the worlds of BLOCK levels and a file per level; return the levels' entity counts."""
+def _contender(policy: Path, manifest: Manifest) -> Contender:
+    prepare_jax()
+    loaded, size = policy_at(policy), size_of(manifest.table["size"][0].as_py())
+    require_size(loaded, size, as_typed(manifest.split), "choose another policy with --policy")
+    return Contender(loaded, BLOCK)
+
+
+def _write_block(
+    folder: Path, manifest: Manifest, first: int, contender: Contender | None
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Write the worlds of BLOCK levels and a file per level; return their entity counts, and what the policy does."""
     rows = manifest.table.slice(first, BLOCK)
     stored = rows.column("shard").is_valid().to_numpy()
     levels = jax.tree.map(np.asarray, levels_of(manifest, rows))
@@ -90,30 +115,45 @@ def _write_block(folder: Path, manifest: Manifest, first: int) -> dict[str, np.n
     motion = read_rows(manifest.split, rows.filter(stored), MOTION) if stored.any() else {}
     rules, lane = rules_of(manifest), 0
     between = (rules.frame_skip - 1) * rules.physics.dt
+    attempts = contender.attempts(levels, rows["level_id"].to_numpy(), rules) if contender else []
     for number, row in enumerate(rows.to_pylist()):
         value: dict[str, Any] = {"row": _plain(row)}
+        if attempts:
+            value["policy"] = _attempt(worlds[number], attempts[number], between)
         if stored[number]:
             value |= _witness(worlds[number], {name: x[..., lane] for name, x in motion.items()}, between, row)
             lane += 1
         _write(folder, f"levels/{(first + number) // FOLDER}/{row['level_id']}", value)
-    return count_entities(levels)
+    return count_entities(levels), [SOLVES if attempt.solved else FAILS for attempt in attempts]
 
 
 def _witness(level: Level, motion: Mapping[str, np.ndarray], between: float, row: Mapping[str, Any]) -> dict[str, str]:
-    """Encode a record's first episode: states of movable bodies, before each step and at the goal, and actions.
-
-    Records keep the state before each env step. Its last physics step finds the contact, `between` seconds later, so
-    the state at the goal is extrapolated.
-    """
-    done, goal, position, rotation, velocity, spin = (
-        motion[f"record/{name}"] for name in ("done", "goal", *(f"state/{name}" for name in STATES))
-    )
+    """Encode a record's first episode."""
+    done, goal = (motion[f"record/{name}"] for name in ("done", "goal"))
     if not succeeds(done[:, None], goal[:, None])[0]:
         raise Failure(f"The record of level {row['level_id']} does not reach the goal: run `levelproof verify`.")
-    steps, (bodies, still) = int(steps_to_goal(done[:, None])[0]), drawn_bodies(level)
+    states = [motion[f"record/state/{name}"] for name in STATES]
+    return _film(level, states, motion["record/action"], int(steps_to_goal(done[:, None])[0]), between)
+
+
+def _attempt(level: Level, attempt: PolicyAttempt, between: float) -> dict[str, Any]:
+    """Encode a policy's episode, and whether it reaches the goal."""
+    states = [np.asarray(getattr(attempt.record.state, name)) for name in STATES]
+    film = _film(level, states, np.asarray(attempt.record.action), attempt.steps, between)
+    return film | {"solved": attempt.solved}
+
+
+def _film(level: Level, motion: Sequence[np.ndarray], action: np.ndarray, steps: int, between: float) -> dict[str, Any]:
+    """Encode an episode: states (STATES) of movable bodies, before each step and at the end, and actions.
+
+    Records keep the state before each env step. Its last physics step finds the contact, `between` seconds later, so
+    the state at the end is extrapolated.
+    """
+    position, rotation, velocity, spin = motion
+    bodies, still = drawn_bodies(level)
     follow = lambda x, v: np.concatenate([x[:steps], x[steps - 1 : steps] + between * v[steps - 1 : steps]])
     states = states_of(follow(position, velocity), follow(rotation, spin), bodies[still:])
-    return {"states": states, "actions": encode_array(motion["record/action"][:steps].astype(np.uint8))}
+    return {"states": states, "actions": encode_array(action[:steps].astype(np.uint8))}
 
 
 def _about(manifest: Manifest, matching: int, where: str | None, columns: list[dict[str, Any]]) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 A missing number is NaN; a missing word is NOTHING.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -50,12 +50,16 @@ def narrow_floats(column: pa.ChunkedArray | pa.Array) -> np.ndarray:
 
 
 def encode_columns(
-    rows: pa.Table, counted: Mapping[str, np.ndarray]
+    rows: pa.Table, counted: Mapping[str, np.ndarray], worded: Mapping[str, Sequence[str]]
 ) -> tuple[list[dict[str, Any]], dict[str, np.ndarray]]:
-    """Describe each column and encode its values; `counted` are numbers that the manifest lacks."""
+    """Describe each column and encode its values.
+
+    `counted` and `worded` are columns of numbers and of words that the manifest lacks.
+    """
     about, values = [], {}
-    for name in [*WORDS, *FLAGS]:
-        words, values[name] = encode_words(rows[name], name)
+    added = {name: pa.array(words) for name, words in worded.items()}
+    for name, column in (added | {name: rows[name] for name in (*WORDS, *FLAGS)}).items():
+        words, values[name] = encode_words(column, name)
         about.append({"name": name, "words": words})
     for name in NUMBERS:
         values[name] = narrow_floats(rows[name])

@@ -18,6 +18,7 @@
       at("step").addEventListener("click", () => { this.play(false); this.step(); });
       at("restart").addEventListener("click", () => this.restart());
       at("watch").addEventListener("click", () => this.watch());
+      at("attempt").addEventListener("click", () => this.attempt());
       addEventListener("keydown", (event) => this.key(event, true));
       addEventListener("keyup", (event) => this.key(event, false));
       addEventListener("blur", () => this.held.clear());
@@ -31,6 +32,7 @@
       this.clock(0);
       this.say("");
       at("watch").disabled = at("save-witness").disabled = !level.witness;
+      at("of-policy").hidden = !level.policy;
     }
 
     // Show a button for each key that an actuator obeys.
@@ -143,7 +145,22 @@
       this.film(await this.link.ask("play"));
     }
 
-    film(film) {
+    // Play the policy's next attempt.
+    async attempt() {
+      at("attempt").disabled = true; // the first one compiles
+      try {
+        const film = await this.link.ask("attempt");
+        if (film.goal) at("watch").disabled = at("save-witness").disabled = false;
+        const steps = `in ${film.actions.length} steps`;
+        this.film(film, film.goal ? `The policy reaches the goal ${steps}: save it below.` : `The policy fails ${steps}.`);
+      } catch (error) {
+        levelproof.problem(error.message);
+      } finally {
+        at("attempt").disabled = false;
+      }
+    }
+
+    film(film, words = `The witness reaches the goal in ${film.actions.length} steps.`) {
       this.play(false);
       this.ended = true;
       this.watching = film;
@@ -158,7 +175,7 @@
         this.clock(step);
         if (step === film.places.length - 1) {
           this.watching = null;
-          this.say(`The witness reaches the goal in ${film.actions.length} steps.`, true);
+          this.say(words, film.goal !== false);
         } else requestAnimationFrame(frame);
       };
       requestAnimationFrame(frame);

@@ -1,4 +1,4 @@
-"""Reader and writer of trajectory arrays in zarr format 2, in which zarr 3 writes no structured arrays.
+"""Reader and writer of trajectory arrays in zarr format 2, in which zarr-python 3 cannot write structured arrays.
 
 An array is a folder with metadata, `.zarray`, and one file per chunk; a group is a folder with `.zgroup`.
 """

@@ -10,20 +10,17 @@ from levelproof.experts.policy import Params, forward, initial
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.observe.flat import dynamic_features, feature_count, level_features
+from tests.experts.networks.weights import random_weights
 
 SIZE = SIZES["s"]
 MOVING, STILL = dynamic_features(SIZE), resting_features(SIZE)
 
 
-def first(network: FlatNetwork) -> Params:
-    """Initial parameters of an expert."""
-    return jax.jit(initial, static_argnums=1)(jax.random.key(0), network, np.zeros(len(STILL), np.float32))
-
-
 @pytest.fixture(scope="module")
 def network() -> tuple[FlatNetwork, Params]:
     network = FlatNetwork(SIZE, width=8, depth=2)
-    return network, jax.tree.map(lambda x: np.asarray(x) + np.float32(0.1), first(network))  # biases count too
+    constant = np.zeros(len(STILL), np.float32)
+    return network, random_weights(lambda: initial(jax.random.key(0), network, constant), 0.1)
 
 
 def whole_kernel(layer: dict) -> np.ndarray:
@@ -51,7 +48,8 @@ def test_folding_constant_features_keeps_the_network_of_the_whole_observation(ne
 
 
 def test_first_kernel_has_orthogonal_rows_across_both_parts() -> None:
-    params = first(FlatNetwork(SIZE, width=8, depth=2))
+    constant = np.zeros(len(STILL), np.float32)
+    params = jax.jit(initial, static_argnums=1)(jax.random.key(0), FlatNetwork(SIZE, width=8, depth=1), constant)
     kernel = whole_kernel(params["params"]["policy"]["FirstDense_0"])  # type: ignore[index]
     np.testing.assert_allclose(kernel @ kernel.T, 2 * np.eye(8), atol=1e-5)
 

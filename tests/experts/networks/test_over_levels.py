@@ -1,30 +1,37 @@
 """Networks for all levels: any size, any order of entities, and the same bits after saving."""
 
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
 
 import levelproof
-from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy
+from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy, policy_logits
 from levelproof.experts.networks.saved import CONFIG, WEIGHTS, Policy
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.rules import reset
+from tests.experts.networks.weights import random_weights
+from tests.quick import jit_once
 
 COUNT = 16
 
 
+@cache
 def policy_of(kind: PolicyKind, size: str = "s") -> Policy:
     """Return a policy with random weights in every layer, so that no logit is close to 0."""
-    network = NetworkConfig(kind, width=16)
-    params = initial_policy(jax.random.key(0), network, SIZES[size])
-    leaves, tree = jax.tree.flatten(params)
-    rng = np.random.default_rng(0)
-    params = jax.tree.unflatten(tree, [x + rng.normal(size=x.shape, scale=0.2).astype(np.float32) for x in leaves])
+    network = NetworkConfig(kind, width=16, depth=1)
+    params = random_weights(lambda: initial_policy(jax.random.key(0), network, SIZES[size]), 0.2)
     return Policy(network, params, SIZES[size] if kind is PolicyKind.FLAT else None, {"made": "for a test"})
+
+
+@partial(jit_once, static_argnums=1)
+def logits_of(params: Any, network: NetworkConfig, level: Level) -> jax.Array:
+    return policy_logits(params, network, level, level.state)
 
 
 def shuffled(level: Level) -> Level:
@@ -50,13 +57,13 @@ def shuffled(level: Level) -> Level:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [PolicyKind.ATTENTION, PolicyKind.INVARIANT])
+@pytest.mark.parametrize("kind", [PolicyKind.ATTENTION, PolicyKind.INVARIANT, PolicyKind.TRANSFORMER])
 def test_order_of_entities_does_not_matter(kind: PolicyKind) -> None:
     levels, policy = levelproof.sample_levels(np.arange(COUNT), "m"), policy_of(kind)
     other = shuffled(jax.tree.map(np.asarray, levels))
-    logits = np.asarray(jax.jit(policy.logits)(levels, levels.state))
+    logits = np.asarray(logits_of(policy.params, policy.network, levels))
     assert np.abs(logits).max() > 0.1
-    np.testing.assert_allclose(jax.jit(policy.logits)(other, other.state), logits, atol=2e-4)
+    np.testing.assert_allclose(logits_of(policy.params, policy.network, other), logits, atol=2e-4)
 
 
 @pytest.mark.slow
@@ -64,18 +71,43 @@ def test_order_of_entities_does_not_matter(kind: PolicyKind) -> None:
 def test_attention_plays_any_size_and_idle_entries_are_zero(size: str) -> None:
     levels, policy = levelproof.sample_levels(np.arange(COUNT), size), policy_of(PolicyKind.ATTENTION)
     episode = reset(levels)
-    for action in (
-        jax.jit(policy.sample)(jax.random.key(0), levels, episode),
-        jax.jit(policy.most_probable)(levels, levels.state),
-    ):
+    both = jit_once(lambda key: (policy.sample(key, levels, episode), policy.most_probable(levels, levels.state)))
+    for action in both(jax.random.key(0)):
         assert action.shape == (6, COUNT)
         assert not np.asarray(action)[~np.asarray(action_mask(levels))].any()
 
 
+def test_transformer_has_the_shape_of_the_reference() -> None:
+    """As counted from its published 786,000 parameters, less the value head: five layers and one number."""
+    network = NetworkConfig(PolicyKind.TRANSFORMER, width=128, depth=2, heads=8)
+    shapes = jax.eval_shape(lambda: initial_policy(jax.random.key(0), network, SIZES["m"]))
+    value_head = 5 * (128 * 128 + 128) + 129
+    assert sum(x.size for x in jax.tree.leaves(shapes)) == 786_369 - value_head
+    with pytest.raises(ValueError, match="multiple of 4"):
+        NetworkConfig(PolicyKind.TRANSFORMER, heads=6)
+
+
+def test_transformer_reads_which_bodies_touch() -> None:
+    levels, policy = levelproof.sample_levels(np.arange(COUNT), "s"), policy_of(PolicyKind.TRANSFORMER)
+    apart = replace(levels.state, contact_active=np.zeros_like(levels.state.contact_active))
+    touching = replace(levels.state, contact_active=np.ones_like(levels.state.contact_active))
+    both = [np.asarray(jax.jit(policy.logits)(levels, state)) for state in (apart, touching)]
+    assert np.abs(both[0] - both[1]).max() > 1e-3
+
+
+def test_pixel_policy_sees_where_bodies_are_and_not_how_they_move() -> None:
+    levels, policy = levelproof.sample_levels(np.arange(COUNT), "s"), policy_of(PolicyKind.PIXELS)
+    logits = np.asarray(jax.jit(policy.logits)(levels, levels.state))
+    faster = replace(levels.state, velocity=levels.state.velocity + 1)
+    np.testing.assert_array_equal(jax.jit(policy.logits)(levels, faster), logits)
+    moved = replace(levels.state, position=levels.state.position.at[4:, 0].add(0.5))
+    assert (np.abs(np.asarray(jax.jit(policy.logits)(levels, moved)) - logits).max(0) > 1e-4).all()
+
+
 def test_logits_differ_between_levels_and_states_of_a_lane_do_not_touch_others() -> None:
     levels, policy = levelproof.sample_levels(np.arange(COUNT), "s"), policy_of(PolicyKind.ATTENTION)
-    alone = policy.logits(levels[3], levels[3].state)
-    np.testing.assert_allclose(np.asarray(policy.logits(levels, levels.state))[:, 3:4], alone, atol=1e-5)
+    alone, among = (logits_of(policy.params, policy.network, some) for some in (levels[[3] * COUNT], levels))
+    np.testing.assert_allclose(among[:, [3] * COUNT], alone, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", list(PolicyKind))
@@ -85,7 +117,7 @@ def test_saved_policy_gives_the_same_bits(kind: PolicyKind, tmp_path: Path) -> N
     loaded = levelproof.load_policy(tmp_path)
     assert (loaded.network, loaded.size, loaded.origin) == (policy.network, policy.size, policy.origin)
     assert loaded.observation_type == policy.observation_type
-    both = [jax.jit(each.logits)(levels, levels.state) for each in (loaded, policy)]
+    both = [logits_of(each.params, each.network, levels) for each in (loaded, policy)]
     np.testing.assert_array_equal(*both)
 
 

@@ -1,4 +1,4 @@
-"""Submissions that share a pool: each gets the results that it gets alone, whenever it arrives."""
+"""Submissions that share a pool: each gets the results that it would get alone, whenever it arrives."""
 
 from dataclasses import replace
 
@@ -8,8 +8,7 @@ import pytest
 
 from levelproof.experts.pool.found import nothing_found
 from levelproof.experts.pool.paused import Paused
-from levelproof.experts.pool.pool import Pool, Submission, capacity_of
-from levelproof.experts.pool.queue import GROUP, empty_queue, enter
+from levelproof.experts.pool.pool import Pool, TrainingJob
 from levelproof.experts.training.slots import Pending, begin
 from levelproof.experts.verdict.judge import KeptExpert, TrainedLevel, Witness
 from levelproof.experts.verdict.portability import PORTABLE, choose
@@ -45,17 +44,15 @@ def part(levels: Level, at: range) -> tuple[Level, np.ndarray]:
     return take(levels, np.array(at, int)), IDS[np.array(at, int)]
 
 
-def finished(pool: Pool, *submissions: Submission) -> list[Submission]:
+def finished(pool: Pool, *submissions: TrainingJob) -> list[TrainingJob]:
     """Step the pool until these submissions have finished; return all in the order in which they finish."""
-    done: list[Submission] = []
+    done: list[TrainingJob] = []
     while not set(submissions) <= set(done):
         done += pool.step()
     return done
 
 
 def test_submissions_give_the_results_that_each_gives_alone(levels: Level, alone: list[TrainedLevel]) -> None:
-    """More levels arrive than the queue can hold, so its entries are reused."""
-    assert capacity_of(CONFIG) < len(IDS)
     pool, parts = new_pool(), [range(20), range(20, 23), range(23, 36), range(0)]
     submissions = [pool.submit(*part(levels, at)) for at in parts]
     order = finished(pool, *submissions)
@@ -80,7 +77,7 @@ def test_later_levels_enter_empty_slots(levels: Level) -> None:
 
 
 def test_withdraw_removes_waiting_levels_and_changes_no_other(levels: Level, alone: list[TrainedLevel]) -> None:
-    """Levels in the queue and before it; another pool gives them the same results."""
+    """Another pool gives them the same results."""
     pool, other = new_pool(), new_pool()
     first, second = pool.submit(*part(levels, range(30))), pool.submit(*part(levels, range(30, 36)))
     for _ in range(3):
@@ -127,7 +124,7 @@ def never_portable(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def steadied(updates: int) -> Pool:
-    """A pool in which solved levels train on for `updates` updates, at most 10 in all."""
+    """Return a pool in which solved levels train on for `updates` updates, at most 10 in all."""
     stopping = replace(SOLVED, steady=updates * CONFIG.steps_per_update)
     return Pool(10 * CONFIG.steps_per_update, untouched(stopping), DEFAULT_RULES)
 
@@ -138,7 +135,7 @@ def trained_by(pool: Pool, levels: Level) -> list[TrainedLevel]:
 
 
 def chosen(levels: Level, i: int, trained: TrainedLevel) -> Witness:
-    """A level's witness."""
+    """Return a level's witness."""
     level, candidates = take(levels, np.array([i])), [trained.candidates]
     (witness,) = choose(level, IDS[[i]], candidates, CONFIG.replays, DEFAULT_RULES)
     assert witness is not None
@@ -193,21 +190,21 @@ def test_further_training_is_independent_of_neighbours_and_pauses(levels: Level)
     at, other = np.array(sorted(paused)), steadied(3)
     later = other.submit(take(levels, at), IDS[at], paused={row: paused[i] for row, i in enumerate(at.tolist())})
     finished(other, later)
-    told = lambda trained, at: [
+    outcomes = lambda trained, at: [
         level._replace(candidates=[chosen(levels, i, level)]) for i, level in zip(at, trained, strict=True)
     ]
-    same(told(later.trained(CONFIG), at), told([alone[i] for i in at], at))
+    same(outcomes(later.trained(CONFIG), at), outcomes([alone[i] for i in at], at))
 
 
 def test_totals_grow_to_the_whole(levels: Level) -> None:
     pool = new_pool()
-    submission, seen = pool.submit(*part(levels, range(5))), []
+    submission, totals = pool.submit(*part(levels, range(5))), []
     while not pool.step():
-        seen.append(pool.totals(submission))
-    seen.append(pool.totals(submission))
-    for numbers in zip(*seen, strict=True):
+        totals.append(pool.totals(submission))
+    totals.append(pool.totals(submission))
+    for numbers in zip(*totals, strict=True):
         assert list(numbers) == sorted(numbers)
-    assert seen[-1][:2] == (submission.trained_rollouts * CONFIG.steps_per_update, 5)
+    assert totals[-1][:2] == (submission.trained_rollouts * CONFIG.steps_per_update, 5)
 
 
 def test_pool_wants_levels_while_fewer_wait_than_slots(levels: Level) -> None:
@@ -223,30 +220,10 @@ def test_pool_wants_levels_while_fewer_wait_than_slots(levels: Level) -> None:
     assert pool.wants(0) == 2
 
 
-def test_queue_reuses_indices_in_any_order(levels: Level) -> None:
-    capacity = capacity_of(CONFIG)
-    queue = empty_queue(levels, capacity, CONFIG)
-    at = np.random.default_rng(0).permutation(capacity)
-    expected = np.zeros(capacity, int)
-    for first in range(0, 36, 12):
-        some, ids = part(levels, range(first, first + 12))
-        indices = [int(at[i % capacity]) for i in range(first, first + 12)]
-        queue = enter(queue, indices, some, ids, no_success(len(ids)), CONFIG, UPDATES)
-        expected[indices] = ids
-    assert int(queue.come) == 36 > capacity
-    np.testing.assert_array_equal(queue.level_ids, expected)
-    same(jax.device_get(queue.levels), take(levels, expected - IDS[0]))
-    np.testing.assert_array_equal(
-        np.asarray(queue.level_ids)[queue.order], [*IDS[capacity:], *IDS[36 - capacity : capacity]]
-    )
-
-
 def test_slow_level_keeps_no_slot_empty(levels: Level) -> None:
-    """Meanwhile more levels come and go than the queue can hold."""
+    """The next level enters as soon as one leaves the other slot."""
     pool = Pool(400 * CONFIG.steps_per_update, untouched(WHOLE), DEFAULT_RULES)
-    groups = np.resize(np.arange(len(IDS)), (-(-len(IDS) // GROUP), GROUP))  # groups that share a compiled program
-    begun = [jax.device_get(begin(take(levels, at), IDS[at], no_success(GROUP), CONFIG)) for at in groups]
-    experts = jax.tree.map(lambda *xs: np.concatenate(xs), *begun)
+    experts = jax.device_get(begin(levels, IDS, no_success(len(IDS)), CONFIG))
     soon, no = np.int32(1), np.bool_(False)  # they leave after an update
     paused = {
         i: Paused(

@@ -23,7 +23,7 @@ from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.experts.random_play import random_successes, searched_randomly
 
-IDS = np.array([3, 107], np.int32)  # of size s: random play of the second survives almost nothing
+IDS = np.array([3, 1522], np.int32)  # of size s: random play of the second survives few replays
 STEADY, FRAGILE = 0, 1
 PROCEDURE = Procedure(SearchConfig(env_steps=0), ExpertConfig(), StopConfig(rule=Rule.NONE))
 
@@ -36,9 +36,9 @@ def levels() -> Level:
 @cache
 def witnesses() -> list[Witness]:
     pairs = zip(*random_successes(levels(), IDS), strict=True)
-    found = [witness for pair in pairs for witness in repeating(Success(*pair), Source.SCOUT)]
-    shares = survival(levels(), IDS, found, 32, DEFAULT_RULES).tolist()
-    return [witness._replace(portability=share) for witness, share in zip(found, shares, strict=True)]
+    successes = [witness for pair in pairs for witness in repeating(Success(*pair), Source.SCOUT)]
+    shares = survival(levels(), IDS, successes, 32, DEFAULT_RULES).tolist()
+    return [witness._replace(portability=share) for witness, share in zip(successes, shares, strict=True)]
 
 
 def test_rework_changes_only_fragile_witnesses(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,10 +71,10 @@ def test_rework_changes_only_fragile_witnesses(monkeypatch: pytest.MonkeyPatch) 
 
 def test_rework_keeps_an_experts_own_witness_unless_most_replays_fail() -> None:
     """The same actions are varied, whatever their source."""
-    found, own = witnesses()[FRAGILE], Source.SAMPLED
-    assert found.portability is not None
+    fragile, own = witnesses()[FRAGILE], Source.SAMPLED
+    assert fragile.portability is not None
     for source, share, stays in ((own, 0.5, True), (own, 0.45, False), (Source.SCOUT, 0.5, False)):
-        before = found._replace(source=source, portability=share)
+        before = fragile._replace(source=source, portability=share)
         some = take(levels(), np.array([FRAGILE]))
         (after,), _ = rework(some, IDS[[FRAGILE]], [before], PROCEDURE, DEFAULT_RULES)
         assert after is not None
@@ -87,6 +87,6 @@ def test_rework_without_rounds_or_replays_changes_nothing() -> None:
         replace(PROCEDURE, search=replace(PROCEDURE.search, steady=0)),
         replace(PROCEDURE, expert=replace(PROCEDURE.expert, replays=0)),
     ):
-        found, env_steps = rework(levels(), IDS, witnesses(), procedure, DEFAULT_RULES)
-        assert all(a is b for a, b in zip(found, witnesses(), strict=True))
+        reworked, env_steps = rework(levels(), IDS, witnesses(), procedure, DEFAULT_RULES)
+        assert all(a is b for a, b in zip(reworked, witnesses(), strict=True))
         assert not env_steps.any()

@@ -73,6 +73,7 @@ def test_result_depends_on_the_level_alone(levels: Level, result: UnitResult) ->
     same(some.record, jax.tree.map(lambda x: x[..., at], result.record))
 
 
+@pytest.mark.campaign  # compiles all programs of training once more
 def test_the_number_of_slots_changes_no_result(levels: Level, result: UnitResult) -> None:
     other = label(levels, IDS, BUDGET, untouched(WHOLE, replace(CONFIG, slots=3)))
     np.testing.assert_equal([vars(verdict) for verdict in other.verdicts], [vars(one) for one in result.verdicts])

@@ -22,13 +22,13 @@ def levels() -> Level:
 
 
 def moves() -> np.ndarray:
-    """Bodies that can move."""
+    """Find bodies that can move."""
     model = levels().model
     return np.asarray(model.active & (model.inverse_mass + model.inverse_inertia > 0))
 
 
 def apart(**changed: jax.Array) -> np.ndarray:
-    """Largest change of a feature by level, when the start is changed like this."""
+    """Return each level's largest change of a feature if its start is changed like this."""
     rows = lambda state: np.asarray(features(levels(), state, CONFIG))
     return np.abs(rows(replace(levels().state, **changed)) - rows(levels().state)).max(-1)
 

@@ -13,13 +13,13 @@ GAP = jax.jit(lambda levels: gap(goals_of(levels), levels.state))
 
 
 def measured(*levels: Level) -> np.ndarray:
-    """Gaps from one compiled program, padded to two levels with the last."""
+    """Return gaps from one compiled program, padded to two levels with the last."""
     many = side_by_side(*levels, *[levels[-1]] * (2 - len(levels)))
     return np.asarray(GAP(many))[: len(levels)]
 
 
 def goal_at(body: int, *, role: Role = Role.BLUE) -> Level:
-    """The switchback, whose goal is another body."""
+    """Return the switchback with plain shelves, and another body in place of its goal."""
     level = switchback()
     level.role[[BAR, BAR + 1, GOAL]], level.role[body] = Role.PLAIN, role
     return level

@@ -13,17 +13,15 @@ from levelproof.experts.config import ExpertConfig, Rule, StopConfig
 from levelproof.experts.labels import Label, Source
 from levelproof.experts.procedure import Procedure
 from levelproof.experts.search.config import SearchConfig
-from levelproof.experts.search.explore import NEARER, Search, _explore, begin, draw, explore, under_way
+from levelproof.experts.search.explore import NEARER, Search, begin, draw, explore, explore_rounds, under_way
 from levelproof.experts.search.near import FAR
 from levelproof.experts.search.play import arena, fresh_walk, play
-from levelproof.experts.search.search import AHEAD, Searching, side_by_side
+from levelproof.experts.search.search import AHEAD, Searching, SearchResult, side_by_side
 from levelproof.experts.search.shorten import shorten
-from levelproof.experts.search.stage import SearchResult
 from levelproof.experts.steps import EnvSteps
 from levelproof.experts.witness.success import Success
 from levelproof.experts.witness.witness import replay
 from levelproof.levelgen.batching import take
-from levelproof.levelgen.identity.keys import GENERATOR
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 from tests.experts.search.worlds import broken, switchback, tower, valley
@@ -40,10 +38,10 @@ SOLVABLE = np.flatnonzero(KINDS != BROKEN)
 def search(levels: Level, level_ids: np.ndarray, config: SearchConfig, rules: TaskParams) -> SearchResult:
     """Search every level to its end."""
     searching = Searching(config, rules)
-    sought = searching.submit(levels, level_ids)
+    job = searching.submit(levels, level_ids)
     while searching.step():
         pass
-    return searching.result(sought)
+    return searching.result(job)
 
 
 @cache
@@ -84,7 +82,7 @@ def test_search_finds_what_random_play_does_not() -> None:
 
 
 def test_search_topples_a_tower() -> None:
-    """Not every search succeeds; random play does in fewer than one episode of a thousand."""
+    """Not every search succeeds; random play does in fewer than one episode in a thousand."""
     four = take(tower(), np.zeros(4, int))
     searched = search(four, IDS[:4], CONFIG, DEFAULT_RULES)
     assert (searched.success.length > 0).any()
@@ -122,21 +120,21 @@ def test_units_share_search_slots() -> None:
     searching, units = Searching(CONFIG, DEFAULT_RULES), [np.arange(3), np.arange(3, 4), np.arange(4, len(KINDS))]
     assert not searching.step()
     assert searching.wants == AHEAD * side_by_side(CONFIG)
-    seen, sought = [], []
+    totals, jobs = [], []
     for some in units:
-        sought.append(searching.submit(take(levels(), some), IDS[some]))
+        jobs.append(searching.submit(take(levels(), some), IDS[some]))
         assert searching.step()
-        seen.append(sum(job.env_steps for job in sought))
-    waiting = searching.waiting(sought[-1])
+        totals.append(sum(job.env_steps for job in jobs))
+    waiting = searching.waiting(jobs[-1])
     assert searching.wants == AHEAD * side_by_side(CONFIG) - len(waiting)
-    left_out, left = searching.submit(levels(), IDS), sought[-1].left
+    left_out, left = searching.submit(levels(), IDS), set(jobs[-1].under_way)
     searching.withdraw(left_out, range(len(KINDS)))
-    assert (left_out.left, sought[-1].left, searching.waiting(sought[-1])) == (0, left, waiting)
-    assert seen == sorted(set(seen))
+    assert (left_out.under_way, jobs[-1].under_way, searching.waiting(jobs[-1])) == (set(), left, waiting)
+    assert totals == sorted(set(totals))
     while searching.step():
         pass
-    for some, job in zip(units, sought, strict=True):
-        assert not job.left
+    for some, job in zip(units, jobs, strict=True):
+        assert not job.under_way
         assert job.ledger.total().search > 0
         same(searching.result(job), jax.tree.map(lambda x, some=some: x[some], found()))
 
@@ -148,9 +146,8 @@ def test_search_depends_on_the_level_id() -> None:
 
 def test_random_draws_are_never_reused() -> None:
     """Every round and level has its own draws."""
-    keys = begun().key
     deal = jax.jit(draw, static_argnums=2)
-    drawn = [deal(keys[level], jnp.int32(env_steps), CONFIG) for level in (0, 1) for env_steps in (0, ROUND)]
+    drawn = [deal(level_id, jnp.int32(env_steps), CONFIG) for level_id in IDS[:2] for env_steps in (0, ROUND)]
     for numbers in zip(*drawn, strict=True):
         assert len({np.asarray(x).tobytes() for x in numbers}) == len(drawn)
 
@@ -158,12 +155,9 @@ def test_random_draws_are_never_reused() -> None:
 def test_interruption_changes_no_result() -> None:
     """The state moves to the host and back, as in a checkpoint."""
     twice = explore(explore(begun(), CONFIG, DEFAULT_RULES), CONFIG, DEFAULT_RULES)
-    key = jax.random.key_data(twice.key)
-    once = explore(begun(), CONFIG, DEFAULT_RULES)
-    plain = replace(once, key=jax.random.key_data(once.key))
-    back = jax.tree.map(jnp.array, jax.tree.map(np.array, plain))
-    resumed = explore(replace(back, key=jax.random.wrap_key_data(back.key, impl=GENERATOR)), CONFIG, DEFAULT_RULES)
-    jax.tree.map(np.testing.assert_array_equal, replace(resumed, key=key), replace(twice, key=key))
+    once = jax.tree.map(np.array, explore(begun(), CONFIG, DEFAULT_RULES))
+    resumed = explore(jax.tree.map(jnp.array, once), CONFIG, DEFAULT_RULES)
+    jax.tree.map(np.testing.assert_array_equal, resumed, twice)
 
 
 def test_env_steps_add_up() -> None:
@@ -187,7 +181,7 @@ def test_level_with_few_cells_leaves_at_a_rung() -> None:
 
 def test_stopping_limits_need_no_recompilation() -> None:
     """Other env steps, rungs or patience need no compiling."""
-    programs = lambda: _explore._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
+    programs = lambda: explore_rounds._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
     explore(begun(), CONFIG, DEFAULT_RULES)
     before = programs()
     given = {"env_steps": 5000, "variations": 7000, "patience": 300, "per_cell": 9, "first_rung": 2048, "bodies": 30}

@@ -42,8 +42,8 @@ def valley() -> Level:
 
 
 def cannon() -> Level:
-    """A ball that has to fly over a low red wall onto a goal behind it; its thrusters push it up and forth, or forth
-    only, and the bar that it starts from is the only ground that is not red."""
+    """A ball must fly over a low red wall to a goal behind it. Its thrusters push it up and forwards, or forwards only;
+    the bar that it starts from is the only ground that is not red."""
     level = world(
         bars=[((0.6, 1.2), (0.4, 0.1), 0.0), ((2.6, 0.7), (0.1, 0.3), 0.0), ((2.5, FLOOR_TOP), (2.5, 0.1), 0.0)],
         bar_role=Role.RED,
@@ -57,8 +57,8 @@ def cannon() -> Level:
 
 
 def tower() -> Level:
-    """Two heavy boxes on each other, green on top, and blue between them and a wall. A ball has to fly over wall and
-    tower and to topple it from behind, at some speed. From this side green falls off the other one, out of reach."""
+    """A tower of two heavy boxes, the upper one green, with blue between it and a wall. A ball must fly over wall and
+    tower and topple it from behind, at some speed. Hit from the front, green would fall off behind, out of reach."""
     boxes = [((3.2, FLOOR_TOP + 0.5), (0.2, 0.5)), ((3.2, FLOOR_TOP + 1.2), (0.25, 0.2))]
     level = world(
         bars=[*((centre, half, 0.0) for centre, half in boxes), ((1.8, FLOOR_TOP + 1.6), (0.1, 1.6), 0.0)],

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from levelproof.experts.config import ExpertConfig, Network
+from levelproof.experts.objective import advantages
 from levelproof.experts.policy import forward, log_probability, network_of, sample
 from levelproof.experts.training import ppo
 from levelproof.experts.training.ppo import LevelConstants, Samples
@@ -27,7 +28,7 @@ def test_advantages_equal_the_plain_formula() -> None:
         alive = 1 - done[t]
         running = reward[t] + 0.9 * following * alive - value[t] + 0.9 * 0.8 * alive * running
         expected[t], following = running, value[t]
-    np.testing.assert_allclose(ppo.advantages(value, reward, done, last, config), expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(advantages(value, reward, done, last, config), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_rows_round_trip_samples() -> None:
@@ -59,8 +60,8 @@ def test_update_learns_a_bandit(kind: Network, seed: int) -> None:
         action = sample(logits, jax.random.uniform(key, (len(CHOICES), count)))
         reward = (action[1] == 2).astype(jnp.float32)
         log_probs = log_probability(logits, action, constants.live[:, None])
-        seen = moving, action, log_probs, value, reward - value, jnp.zeros(count)
-        samples = Samples(*(x[None] for x in seen))
+        columns = moving, action, log_probs, value, reward - value, jnp.zeros(count)
+        samples = Samples(*(x[None] for x in columns))
         rows = ppo.as_rows(samples)
         return ppo.update(now, jax.random.fold_in(key, 1), network, constants, rows, config), reward.mean()
 

@@ -35,7 +35,7 @@ def test_follow_adds_up_totals(seed: int, p_done: float, p_goal: float) -> None:
             if d:
                 returns.append(running)
                 running = 0.0
-    hits = np.flatnonzero((long(goal) & own).any(-1))  # what others than the expert reach is not its own
+    hits = np.flatnonzero((long(goal) & own).any(-1))  # goals reached in other lanes are not the expert's own
     assert totals.episodes == len(returns)
     assert totals.best_return == max(returns, default=-np.inf)
     assert totals.first_success == ((hits[0] + 1) * ENVIRONMENTS if len(hits) else progress.NEVER)

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from benchmarks.alone import label
+from benchmarks.endless import endless_slots
 from levelproof.experts.config import ExpertConfig, Rule, StopConfig
 from levelproof.experts.labels import Label, Source
 from levelproof.experts.pool.found import nothing_found
-from levelproof.experts.pool.pool import Pool, Submission, capacity_of
-from levelproof.experts.pool.queue import empty_queue, enter
+from levelproof.experts.pool.pool import Pool, TrainingJob
 from levelproof.experts.training import advance as advance_module
 from levelproof.experts.training.advance import advance
 from levelproof.experts.training.progress import NEVER
-from levelproof.experts.training.slots import LevelQueue, Mode, empty_slots
+from levelproof.experts.training.slots import Mode
 from levelproof.experts.training.stop import rules_of
 from levelproof.experts.verdict.judge import TrainedLevel
-from levelproof.experts.witness.success import Success, no_success
+from levelproof.experts.witness.success import Success
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
@@ -34,18 +34,12 @@ UPDATES = 24  # 12,288 env steps
 
 def train(
     levels: Level, level_ids: np.ndarray, updates: int, config: ExpertConfig, stopping: StopConfig, **how: Any
-) -> tuple[list[TrainedLevel], Submission]:
+) -> tuple[list[TrainedLevel], TrainingJob]:
     pool = Pool(updates * config.steps_per_update, untouched(stopping, config), DEFAULT_RULES)
     submission = pool.submit(levels, level_ids, **how)
     while not pool.step():
         pass
     return submission.trained(config), submission
-
-
-def queue_of(levels: Level, updates: int) -> LevelQueue:
-    """Return a queue of the sizes of a pool, so that they share a program."""
-    queue = empty_queue(levels, capacity_of(CONFIG), CONFIG)
-    return enter(queue, range(len(IDS)), levels, IDS, no_success(len(IDS)), CONFIG, updates)
 
 
 @pytest.fixture(scope="module")
@@ -90,26 +84,16 @@ def test_result_depends_neither_on_slot_nor_on_neighbours(
         same(level, solved[i])
 
 
-def test_next_level_enters_a_freed_slot_at_once(levels: Level) -> None:
-    """No slot is empty while a level waits, and every level gets one slot."""
-    queue = queue_of(levels, 2)
-    slots = empty_slots(2, queue, CONFIG)
-    modes, indices = [], []
-    for _ in range(400):
-        slots, seen = advance(slots, queue, CONFIG, rules_of(WHOLE, CONFIG), SHAPED)
-        modes.append(np.asarray(seen.mode))
-        indices.append(np.where(modes[-1] == Mode.EMPTY, -1, np.asarray(seen.queue_index)))
-        if (modes[-1] == Mode.EMPTY).all():
-            break
-    modes, indices = np.array(modes), np.array(indices)
-    assert sorted(set(indices.reshape(-1)) - {-1}) == list(range(len(IDS)))
-    waited_for = (indices == len(IDS) - 1).any(1).argmax()  # the last level has come
-    assert (modes[:waited_for] != Mode.EMPTY).all()
-    for index in range(len(IDS)):
-        rows, slot = np.nonzero(indices == index)
-        assert len(set(slot)) == 1
-        assert (np.diff(rows) == 1).all()
-        assert (modes[rows, slot[0]] == [Mode.TRAIN] * 2 + [Mode.EVALUATE] * CONFIG.record_rollouts).all()
+def test_level_trains_then_is_evaluated_then_leaves(levels: Level) -> None:
+    slots, modes, left = endless_slots(take(levels, np.arange(2)), IDS[:2], CONFIG, updates=2), [], []
+    for _ in range(2 + CONFIG.record_rollouts + 1):
+        slots, report = advance(slots, CONFIG, rules_of(WHOLE, CONFIG), SHAPED)
+        modes.append(report.mode)
+        left.append(report.left)
+    path = [Mode.TRAIN] * 2 + [Mode.EVALUATE] * CONFIG.record_rollouts + [Mode.EMPTY]
+    np.testing.assert_array_equal(modes, np.transpose([path] * 2))
+    np.testing.assert_array_equal(np.sum(left, axis=0), 1)
+    assert left[-2].all()
 
 
 def test_advance_is_compiled_once(levels: Level) -> None:
@@ -149,15 +133,15 @@ def test_fruitless_expert_reports_why_it_left(levels: Level, whole: list[Trained
 
 def test_success_of_training_is_the_witness_if_no_evaluation_succeeds(levels: Level) -> None:
     """Which level qualifies depends on the machine's rounding, so several budgets are tried."""
-    found = set()
+    sources = set()
     for updates in (2, 3, 4, 6, 8, 12):
         for verdict in label(levels, IDS, updates * 512, untouched(replace(WHOLE, successes=4))).verdicts:
-            found.add(verdict.witness)
+            sources.add(verdict.witness)
             if verdict.steps_to_first_success is not None:
                 assert verdict.label is Label.SOLVED
             if verdict.witness is Source.EXPLORATION:
                 assert not verdict.most_probable_succeeds
-    assert Source.EXPLORATION in found
+    assert Source.EXPLORATION in sources
 
 
 @pytest.mark.campaign
@@ -189,14 +173,15 @@ def test_continued_expert_equals_one_trained_without_a_break(levels: Level, stop
 
 def test_expert_rehearses_an_earlier_success_from_the_first_update(levels: Level, whole: list[TrainedLevel]) -> None:
     """The first episode repeats it to the goal; rehearsing lanes do not count as the expert's own."""
-    found = nothing_found(len(IDS))._replace(success=random_successes(levels, IDS))
-    trained, _ = train(levels, IDS, 2, CONFIG, WHOLE, found=found)
-    assert 0 < (found.success.length > 0).sum() < len(IDS)
+    findings = nothing_found(len(IDS))._replace(success=random_successes(levels, IDS))
+    trained, _ = train(levels, IDS, 2, CONFIG, WHOLE, found=findings)
+    assert 0 < (findings.success.length > 0).sum() < len(IDS)
     for i, level in enumerate(trained):
         assert (
-            np.array_equal(level.evaluations[-1].success.action, found.success.action[i]) or not found.success.length[i]
+            np.array_equal(level.evaluations[-1].success.action, findings.success.action[i])
+            or not findings.success.length[i]
         )
-        if not found.success.length[i]:
+        if not findings.success.length[i]:
             same(level.curve, whole[i].curve[:2])
 
 
@@ -231,19 +216,18 @@ def test_diverged_expert_leaves_and_reports_why(levels: Level, whole: list[Train
 @pytest.mark.campaign
 def test_vmapped_slots_of_accelerators_give_the_same_results(levels: Level, monkeypatch: pytest.MonkeyPatch) -> None:
     """Decisions are equal, numbers nearly so, because sums are taken in another order."""
-    queue = queue_of(levels, 3)
 
     def go(advance) -> list:
-        slots, seen = empty_slots(2, queue, CONFIG), []
-        for _ in range(3 + CONFIG.record_rollouts + 2):  # an update of the second levels is among them
-            slots, report = advance(slots, queue, CONFIG, rules_of(WHOLE, CONFIG), SHAPED)
-            seen.append(report)
-        return [jax.device_get(seen), jax.device_get(slots.slot.training)]
+        slots, reports = endless_slots(take(levels, np.arange(2)), IDS[:2], CONFIG, updates=3), []
+        for _ in range(3 + CONFIG.record_rollouts):
+            slots, report = advance(slots, CONFIG, rules_of(WHOLE, CONFIG), SHAPED)
+            reports.append(report)
+        return [jax.device_get(reports), jax.device_get(slots.slot.training)]
 
     one_by_one, ours = go(advance)
     monkeypatch.setattr(advance_module, "over_slots", lambda function, *slots: jax.vmap(function)(*slots))
-    together, theirs = go(jax.jit(advance.__wrapped__, static_argnums=(2, 4)))
-    same([(r.queue_index, r.mode, r.left) for r in one_by_one], [(r.queue_index, r.mode, r.left) for r in together])
+    together, theirs = go(jax.jit(advance.__wrapped__, static_argnums=(1, 3)))
+    same([(r.mode, r.left) for r in one_by_one], [(r.mode, r.left) for r in together])
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, atol=1e-3), ours.train_state.params, theirs.train_state.params
     )

@@ -148,7 +148,7 @@ def test_solves_and_fails_count_attempts() -> None:
 def test_steps_after_the_record_decide_nothing() -> None:
     """Rollouts of an evaluation extend beyond the record if the horizon does not divide it."""
     done, goal = np.zeros((2, 300, 16), bool)
-    done[50] = goal[50] = done[280] = True  # all reach the goal, and fail behind the record
+    done[50] = goal[50] = done[280] = True  # all reach the goal within the record, and fail after it
     rules = rules_of(StopConfig(successes=8), CONFIG)
     assert bool(stop.solves(done, goal, rules, CONFIG))
     assert not bool(stop.fails(done, goal, 300, rules, CONFIG))

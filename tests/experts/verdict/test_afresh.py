@@ -66,5 +66,5 @@ def test_success_rate_depends_on_the_level_alone(levels: Level, run: TrainingRun
     assert run.submission
     trained, some = run.submission.trained(CONFIG), [7, 2, 5]
     policies = [trained[i].policy for i in some]
-    found = attempt(take(levels, run.left[some]), IDS[run.left[some]], policies, CONFIG, DEFAULT_RULES)  # pyright: ignore
-    np.testing.assert_array_equal(found.success_rate, [result.verdicts[i].success_rate for i in run.left[some]])
+    results = attempt(take(levels, run.left[some]), IDS[run.left[some]], policies, CONFIG, DEFAULT_RULES)  # pyright: ignore
+    np.testing.assert_array_equal(results.success_rate, [result.verdicts[i].success_rate for i in run.left[some]])

@@ -22,7 +22,7 @@ CONFIG = ExpertConfig(environments=8, rehearsals=2, attempts=3, sticky_attempts=
 
 
 def evaluation(*episodes: list[tuple[int, bool]], success: int = 0, config: ExpertConfig = CONFIG) -> Evaluation:
-    """An evaluation with these episodes: (last step, whether it reached the goal). Actions count the steps."""
+    """Return an evaluation with these episodes: (last step, whether it reached the goal). Actions count the steps."""
     done, goal = np.zeros((2, RECORD_STEPS, config.environments), bool)
     for environment, ends in enumerate(episodes):
         for end, reached in ends:
@@ -63,15 +63,15 @@ def test_candidates_come_from_all_evaluations() -> None:
 
 def test_candidates_are_all_successes_shortest_first() -> None:
     one, two = evaluation([(99, True)], [(9, True), (29, False)], [(30, True)]), evaluation([(30, True)], [(20, True)])
-    steps = lambda found: [(witness.steps, witness.source) for witness in found]
+    steps = lambda candidates: [(witness.steps, witness.source) for witness in candidates]
     sampled, probable = Source.SAMPLED, Source.MOST_PROBABLE
-    found = candidates_of([one, two], Source.SCOUT, CONFIG)
-    assert steps(found) == [(21, sampled), (31, sampled), (31, probable), (100, probable)]
+    candidates = candidates_of([one, two], Source.SCOUT, CONFIG)
+    assert steps(candidates) == [(21, sampled), (31, sampled), (31, probable), (100, probable)]
     assert steps(candidates_of([one, two], Source.SCOUT, replace(CONFIG, replays=0))) == [
         (31, probable),
         (100, probable),
     ]
-    for witness in found:
+    for witness in candidates:
         assert witness.action.shape == (RECORD_STEPS, 6)
 
 
@@ -79,8 +79,8 @@ def test_candidates_are_the_shortest_without_copies() -> None:
     config = replace(CONFIG, witness=Choice.SHORTEST)
     ends = [(end, True) for end in np.cumsum(np.arange(20, 8, -1)).tolist()]
     one = evaluation(ends)
-    found = candidates_of([one, one, one], Source.SCOUT, config)
-    assert [witness.steps for witness in found] == [n for n in [*range(9, 20), 21] for _ in "123"]
+    candidates = candidates_of([one, one, one], Source.SCOUT, config)
+    assert [witness.steps for witness in candidates] == [n for n in [*range(9, 20), 21] for _ in "123"]
     whole = [[(end, True)] for end in range(40, 10, -1)]
     many = replace(CONFIG, environments=len(whole), attempts=len(whole), sticky_attempts=0, moved_attempts=0)
     shortest = candidates_of([evaluation(*whole, config=many)], Source.SCOUT, many)
@@ -95,10 +95,10 @@ def test_rehearsed_success_is_a_candidate_only_if_allowed_and_without_others() -
     failed, solved = evaluation([(9, False)], success=4), evaluation([(9, True)], success=4)
     assert best_of([failed], Source.SCOUT, replace(CONFIG, exploration=False)) is None
     assert best_of([evaluation([(9, False)])], Source.SCOUT, CONFIG) is None
-    found, own = best_of([failed], Source.SCOUT, CONFIG), best_of([solved], Source.SCOUT, CONFIG)
-    assert found is not None
+    rehearsed, own = best_of([failed], Source.SCOUT, CONFIG), best_of([solved], Source.SCOUT, CONFIG)
+    assert rehearsed is not None
     assert own is not None
-    assert (found.source, found.steps) == (Source.SCOUT, 4)
+    assert (rehearsed.source, rehearsed.steps) == (Source.SCOUT, 4)
     assert own.source is Source.MOST_PROBABLE
     assert [witness.source for witness in candidates_of([solved], Source.SCOUT, CONFIG)] == [own.source]
 

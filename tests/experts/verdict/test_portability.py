@@ -36,7 +36,7 @@ def levels() -> Level:
 
 @pytest.fixture(scope="module")
 def witnesses(levels: Level) -> list[Witness]:
-    """Successes of random play in all but the last level."""
+    """Return successes of random play in all but the last level."""
     at = np.arange(FOUND)
     success = random_successes(take(levels, at), IDS[at])
     each = zip(success.action, success.length, strict=True)
@@ -50,7 +50,7 @@ def shares(levels: Level, witnesses: list[Witness]) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def starts(levels: Level) -> Level:
-    """Perturbed starts of the first levels."""
+    """Return perturbed starts of the first levels."""
     at = np.arange(FOUND)
     lanes = repeat(take(levels, at), REPLAYS)
     return jax.device_get(replace(lanes, state=jax.jit(moved, static_argnums=2)(lanes, IDS[at], REPLAYS)))
@@ -77,7 +77,7 @@ def test_moved_perturbs_starts_by_one_unit_in_the_last_place(levels: Level, star
         x, y = (np.moveaxis(np.asarray(getattr(level.state, name)), 0, -2) for level in (before, after))
         near = [x, np.nextafter(x, np.float32(np.inf)), np.nextafter(x, np.float32(-np.inf))]
         assert np.any([y == a for a in near], 0).all()
-        if name != "rotation":  # many lie flat, where the next number is none that processors tell from 0
+        if name != "rotation":  # many angles are 0, whose next float is subnormal and flushed to 0
             assert [np.any((y == a) & (x != 0) & movable) for a in near] == [x.any()] * 3
         np.testing.assert_array_equal(y[..., ~movable], x[..., ~movable])
     untouched = replace(after, state=replace(after.state, **{
@@ -99,17 +99,17 @@ def test_portability_depends_on_the_level_alone(
 def test_survival_pads_few_candidates_to_a_small_block_on_accelerators(
     monkeypatch: pytest.MonkeyPatch, count: int, blocks: list[int]
 ) -> None:
-    seen = []
+    block_sizes = []
 
     def replayed(levels, level_ids, action, steps, replays, rules):
-        seen.append(len(level_ids))
+        block_sizes.append(len(level_ids))
         return level_ids.astype(np.float32)
 
-    monkeypatch.setattr(portability, "_survival", replayed)
+    monkeypatch.setattr(portability, "survival_block", replayed)
     monkeypatch.setattr(portability, "at_once", lambda lanes, in_cache: 128)
     witness = Witness(np.zeros((256, 6), int), Source.SAMPLED, 1)
-    found = survival(np.zeros((1, count)), np.arange(count), [witness] * count, REPLAYS, DEFAULT_RULES)  # pyright: ignore[reportArgumentType]
-    assert (found.tolist(), seen) == ([*range(count)], blocks)
+    survived = survival(np.zeros((1, count)), np.arange(count), [witness] * count, REPLAYS, DEFAULT_RULES)  # pyright: ignore[reportArgumentType]
+    assert (survived.tolist(), block_sizes) == ([*range(count)], blocks)
 
 
 def test_choose_takes_the_most_portable_candidate_first_of_equals(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,8 +127,8 @@ def test_choose_takes_the_most_portable_candidate_first_of_equals(monkeypatch: p
     ]
     levels, ids = np.zeros((1, 5)), np.arange(5)
     chosen = choose(levels, ids, candidates, REPLAYS, DEFAULT_RULES)  # pyright: ignore[reportArgumentType]
-    told = [(witness.steps, witness.portability) if witness else None for witness in chosen]
-    assert told == [(2, 0.5), None, (4, 1.0), (5, 0.0), (4, 1.0)]
+    results = [(witness.steps, witness.portability) if witness else None for witness in chosen]
+    assert results == [(2, 0.5), None, (4, 1.0), (5, 0.0), (4, 1.0)]
     assert (2, 5) not in replayed
     assert (4, 2) not in replayed, "the one before survived all"
     replayed.clear()

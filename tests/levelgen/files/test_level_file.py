@@ -53,7 +53,7 @@ def document() -> Any:
 
 
 def changed(path: str, value: object) -> Any:
-    """Return that level with another value at a path such as `env_state.polygon.4.radius`."""
+    """Return `document()` with another value at a path such as `env_state.polygon.4.radius`."""
     altered = copy.deepcopy(document())
     *parents, last = path.split(".")
     parent = functools.reduce(lambda x, key: x[int(key) if isinstance(x, list) else key], parents, altered)
@@ -198,7 +198,7 @@ def test_reader_refuses_a_joint_from_a_body_to_itself() -> None:
     ],
 )
 def test_reader_refuses_unknown_bindings_of_active_actuators(kind: str, binding: int, most: int, names: str) -> None:
-    """A motor that is off and a fixed joint, too: a policy reads their bindings."""
+    """Even of a motor that is off and of a fixed joint: a policy reads their bindings."""
     for switches in ({}, {"motor_on": False}, {"is_fixed_joint": True}):
         altered = changed(f"env_state.{kind}.0.{names}_binding", binding)
         altered["env_state"][kind][0] |= {"active": True, **(switches if kind == "joint" else {})}
@@ -264,8 +264,8 @@ JUNK = st.recursive(
 
 
 @functools.cache
-def places() -> list[tuple[str, ...]]:
-    """Return the paths of everything in the level that is read."""
+def paths() -> list[tuple[str, ...]]:
+    """Return the path of every value in the level that the reader reads."""
 
     def below(value: Any, path: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
         yield path
@@ -282,7 +282,7 @@ def places() -> list[tuple[str, ...]]:
 def test_reader_reads_or_refuses_arbitrary_values_anywhere(changes) -> None:
     altered = copy.deepcopy(document())
     for number, what, junk in changes:
-        *parents, last = places()[number % len(places())]
+        *parents, last = paths()[number % len(paths())]
         try:
             parent = functools.reduce(lambda x, key: x[int(key) if isinstance(x, list) else key], parents, altered)
             key = int(last) if isinstance(parent, list) else last

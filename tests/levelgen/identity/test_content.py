@@ -177,7 +177,7 @@ def test_mirror_image_has_another_content_hash() -> None:
     assert content_hashes(edited(level, state={"position": mirrored})) != content_hashes(level)
 
 
-def test_content_hashes_of_version_1() -> None:
+def test_content_hashes_stay_those_of_version_1() -> None:
     """Uses a level made without the sampler, whose last bits may differ between machines."""
     level: Level = jax.tree.map(np.zeros_like, one("m", 0))
     level.model.active[[0, 4, 6]] = True
@@ -196,12 +196,12 @@ def test_content_hashes_of_version_1() -> None:
 
 def play(level: Level, actions: np.ndarray) -> np.ndarray:
     """Return positions and angles of all bodies after each env step, (step, body, 3, level)."""
-    rules, now, seen = TaskParams(dense_reward_scale=0.0), reset(level), []
+    rules, now, poses = TaskParams(dense_reward_scale=0.0), reset(level), []
     go = jax.jit(lambda now, action: step(level, now, action, rules)[0])
     for action in actions:
         now = go(now, action)
-        seen.append(np.concatenate([now.state.position, np.asarray(now.state.rotation)[:, None]], 1))
-    return np.array(seen)
+        poses.append(np.concatenate([now.state.position, np.asarray(now.state.rotation)[:, None]], 1))
+    return np.array(poses)
 
 
 @pytest.mark.parametrize("size", SOME)
@@ -215,7 +215,7 @@ def test_idle_values_change_no_bits_of_an_episode(size: str) -> None:
 
 @pytest.mark.parametrize("size", SOME)
 def test_levels_of_equal_hash_play_alike(size: str) -> None:
-    """Except for the last bits, which depend on the order of the solver's sums and grow by chaos."""
+    """Except for the last bits, which depend on the order of the solver's sums, and differ chaotically later on."""
     level, rng = sampled(size), np.random.default_rng(0)
     weak = (weakened(level) & level.model.joint_active).any(0)
     assert weak.any() == (size != "s")  # joints of size s have no limits
@@ -259,22 +259,22 @@ def by_hand(world: World) -> list[str]:
         itertools.product((1, -1), repeat=2),
     )
 
-    def written(place, entry, flame, sign) -> list[str]:
+    def written(rank, entry, flame, sign) -> list[str]:
         lines = [
-            str(sorted((place[s.first], place[s.second], s.row, s.direction, -1) if s.entry == NO_ENTRY else
-                       (place[s.first], place[s.second], s.row, s.direction * sign[s.entry], entry[s.entry])
+            str(sorted((rank[s.first], rank[s.second], s.row, s.direction, -1) if s.entry == NO_ENTRY else
+                       (rank[s.first], rank[s.second], s.row, s.direction * sign[s.entry], entry[s.entry])
                        for s in sides))
             for sides in world.joints
         ]  # fmt: skip
-        lines += [f"push {place[p.body]} {p.row!r} {flame[p.entry]}" for p in world.pushes]
-        return sorted(lines + [f"apart {sorted((place[i], place[j]))}" for i, j in world.apart])
+        lines += [f"push {rank[p.body]} {p.row!r} {flame[p.entry]}" for p in world.pushes]
+        return sorted(lines + [f"apart {sorted((rank[i], rank[j]))}" for i, j in world.apart])
 
     return min(written(*way) for way in ways)
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(2, 3).flatmap(lambda count: st.tuples(worlds(count), worlds(count))))
-def test_worlds_have_one_form_exactly_if_some_renumbering_maps_them(both: tuple[World, World]) -> None:
+def test_worlds_of_equal_form_are_renumberings_of_each_other(both: tuple[World, World]) -> None:
     if canonical_form(both[0]) == canonical_form(both[1]):
         assert by_hand(both[0]) == by_hand(both[1])
 
@@ -284,16 +284,16 @@ def test_form_ignores_the_numbering_of_copies_that_are_joined_differently() -> N
     links = [(0, 1, b"left"), (0, 2, b"right"), (1, 3, b"left knee"), (2, 4, b"right knee")]
     joints = [(Side(a, b, row, 1, k), Side(b, a, row + b" back", -1, k)) for k, (a, b, row) in enumerate(links)]
     walker = World(b"", [b"body", *[b"thigh"] * 2, *[b"shin"] * 2], joints, [], [(1, 2)])
-    forms = {canonical_form(moved(walker, np.array(order))) for order in itertools.permutations(range(5))}
+    forms = {canonical_form(reordered(walker, np.array(order))) for order in itertools.permutations(range(5))}
     assert len(forms) == 1
 
 
-def moved(world: World, place: np.ndarray) -> World:
-    """Renumber body i as place[i]; reorder joints and entries."""
-    side = lambda s: s._replace(first=int(place[s.first]), second=int(place[s.second]))
-    bodies = [world.bodies[i] for i in np.argsort(place)]
+def reordered(world: World, rank: np.ndarray) -> World:
+    """Renumber body i as rank[i]; reverse the order of joints and of their sides."""
+    side = lambda s: s._replace(first=int(rank[s.first]), second=int(rank[s.second]))
+    bodies = [world.bodies[i] for i in np.argsort(rank)]
     joints = [(side(b), side(a)) for a, b in reversed(world.joints)]
-    return World(world.gravity, bodies, joints, [], [(int(place[j]), int(place[i])) for i, j in world.apart])
+    return World(world.gravity, bodies, joints, [], [(int(rank[j]), int(rank[i])) for i, j in world.apart])
 
 
 def test_form_tells_a_ring_of_six_copies_from_two_rings_of_three() -> None:

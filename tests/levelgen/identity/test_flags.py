@@ -46,7 +46,7 @@ def digest(arrays: Any) -> str:
 
 
 def results() -> Iterator[str]:
-    """Yield digests of draws from every stream, of levels, and of random play in them, a line each."""
+    """Yield digests of draws from every stream, of levels, and of random play in them, one per line."""
     yield digest(jax.jit(lambda: {stream: {f: DRAWS[f](key_for(5, stream)) for f in DRAWS} for stream in Stream})())
     levels = sample_levels(IDS, SIZES["s"])
     yield " ".join(content_hashes(levels))

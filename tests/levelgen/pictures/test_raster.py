@@ -1,4 +1,4 @@
-"""Pictures show what they must, in the colours that the module describes; films play."""
+"""Pictures show what they must, in the colours of their style; films play."""
 
 import dataclasses
 
@@ -39,8 +39,8 @@ def test_picture_shows_bodies_in_their_role_colours(golden) -> None:
     movable = model.active & (model.inverse_mass != 0)
     for role in Role:
         lanes = np.flatnonzero((movable & (golden.level.role == role) & (golden.state.position[:, 1] > 0.3)).any(0))[:5]
-        seen = [shows(draw(golden.level, golden.state, lane), ROLE_COLOUR[role]) for lane in lanes]
-        assert sum(seen) >= 4, role  # a body may hide behind another
+        shown = [shows(draw(golden.level, golden.state, lane), ROLE_COLOUR[role]) for lane in lanes]
+        assert sum(shown) >= 4, role  # a body may hide behind another
 
 
 def test_pictures_of_a_level_have_one_size(golden) -> None:
@@ -126,8 +126,8 @@ def test_gif_shows_each_picture_for_its_time(golden, tmp_path) -> None:
         assert film.info["duration"] == 70
         film.seek(4)
         assert film.info["duration"] == 1000
-        seen = np.asarray(film.convert("RGB")).astype(int)
-    assert np.abs(seen - np.asarray(pictures[4]).astype(int)).mean() < 4  # 128 colours are enough
+        last = np.asarray(film.convert("RGB")).astype(int)
+    assert np.abs(last - np.asarray(pictures[4]).astype(int)).mean() < 4  # 128 colours are enough
     write_png(sheet(pictures, 3), tmp_path / "sheet.png")
     with Image.open(tmp_path / "sheet.png") as page:
         assert page.size == (3 * pictures[0].size[0], 2 * pictures[0].size[1])

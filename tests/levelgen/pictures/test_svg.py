@@ -37,7 +37,7 @@ def scene(sample, lane: int, **caption) -> Scene:
 
 
 def film(sample, steps: int = 5) -> tuple[list[Scene], list[float]]:
-    """Show one level in states of others, so that everything moves, turns, and goes on and off."""
+    """Show one level in states of others, so that every part moves, turns, appears and vanishes."""
     level = jax.tree.map(lambda x: x[..., :1], sample.level)
     captions = [Caption("film", f"{step} s", "goal reached" if step == steps - 1 else "") for step in range(steps)]
     scenes = [scene_of(level, sample.state, step, sample.action[:, step], words) for step, words in enumerate(captions)]
@@ -100,7 +100,7 @@ def _value(element: ET.Element, second: float) -> str:
 
 
 def test_comparison_notices_a_moved_or_missing_part(golden) -> None:
-    """One part that is moved by six pixels or missing."""
+    """One part is six pixels away from its position, or missing."""
     still = scene(golden["l"], 3)
     body = max(i for i, part in enumerate(still.parts) if part.angle)
     part = still.parts[body]

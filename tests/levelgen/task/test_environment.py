@@ -63,22 +63,22 @@ def play(env: Environment, params: EnvParams, state: EnvState, keys: jax.Array, 
     def step(state, inputs):
         number, action = inputs
         each = jax.vmap(lambda key: jax.random.fold_in(key, number))(keys)
-        seen, state, reward, done, _ = jax.vmap(env.step, (0, 0, 0, None))(each, state, action, params)
-        return state, (seen, reward, done)
+        observed, state, reward, done, _ = jax.vmap(env.step, (0, 0, 0, None))(each, state, action, params)
+        return state, (observed, reward, done)
 
     return jax.jit(lambda: jax.lax.scan(step, state, (jnp.arange(STEPS), jnp.asarray(actions))))()
 
 
 def test_mapped_step_equals_the_tasks_step(levels: Level, keys, actions) -> None:
     env, params = make(levels, auto_reset=False)
-    state, (seen, reward, done) = play(env, params, starts(levels), keys, actions)
+    state, (observed, reward, done) = play(env, params, starts(levels), keys, actions)
     world, advance = task.reset(levels), jax.jit(lambda world, action: task.advance(levels, world, action, env.rules))
     for step in range(STEPS):
         world, outcome = advance(world, jnp.asarray(actions[step].T))
         np.testing.assert_array_equal(reward[step], outcome.reward)
         np.testing.assert_array_equal(done[step], outcome.done)
     assert_same(lanes_last(state.now), world)
-    np.testing.assert_allclose(seen[-1].T, jax.jit(symbolic_flat)(levels, world.state), rtol=1e-6)
+    np.testing.assert_allclose(observed[-1].T, jax.jit(symbolic_flat)(levels, world.state), rtol=1e-6)
 
 
 @pytest.mark.campaign
@@ -114,8 +114,8 @@ def test_mapped_loop_equals_a_loop_of_mapped_steps(levels: Level, made, keys, ac
     def episode(key, state, actions):
         def step(state, inputs):
             number, action = inputs
-            seen, state, reward, done, _ = env.step(jax.random.fold_in(key, number), state, action, params)
-            return state, (seen, reward, done)
+            observed, state, reward, done, _ = env.step(jax.random.fold_in(key, number), state, action, params)
+            return state, (observed, reward, done)
 
         return jax.lax.scan(step, state, (jnp.arange(STEPS), actions))
 
@@ -168,14 +168,14 @@ def test_reusing_one_key_still_meets_every_level(levels: Level) -> None:
 def test_step_resets_after_the_end(levels: Level, keys) -> None:
     env, params = make(levels, rules=task.TaskParams(max_timesteps=1))
     stop, own = jnp.zeros((LEVELS, 6), jnp.int32), starts(levels)
-    seen, state, _, done, info = jax.jit(jax.vmap(env.step, (0, 0, 0, None, 0)))(keys, own, stop, params, own)
+    observed, state, _, done, info = jax.jit(jax.vmap(env.step, (0, 0, 0, None, 0)))(keys, own, stop, params, own)
     assert done.all()
     assert set(info) == {"GoalR", "distance", "terminated", "truncated", "level_index"}
     assert info["truncated"].sum() > LEVELS / 2  # the rest reached the goal or failed in that step
     np.testing.assert_array_equal(info["level_index"], np.arange(LEVELS))
     assert (np.asarray(info["distance"]) > 0).all()
     assert_same(state, own)  # the given state and its observation
-    np.testing.assert_array_equal(seen, jax.jit(jax.vmap(env.get_obs))(own))
+    np.testing.assert_array_equal(observed, jax.jit(jax.vmap(env.get_obs))(own))
     _, drawn, _, done, _ = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))(keys, own, stop, params)
     assert done.all()
     assert (np.asarray(drawn.now.timestep) == 0).all()
@@ -191,10 +191,10 @@ def test_info_reports_the_end_and_the_last_observation(levels: Level, keys, acti
     state, ends = starts(levels), np.zeros(2, int)
     for number in range(2 * limit):
         played = np.asarray(state.level_index)
-        seen, final, reward, done, _ = alone(keys, state, actions[number % STEPS], params)
-        seen_next, after, reward_next, done_next, info = step(keys, state, actions[number % STEPS], params)
+        observed, final, reward, done, _ = alone(keys, state, actions[number % STEPS], params)
+        observed_next, after, reward_next, done_next, info = step(keys, state, actions[number % STEPS], params)
         assert_same((reward, done), (reward_next, done_next))
-        assert_same(info["final_observation"], seen)
+        assert_same(info["final_observation"], observed)
         assert_same(info["level_index"], played)
         assert_same(info["terminated"] | info["truncated"], done)
         assert not (info["terminated"] & info["truncated"]).any()
@@ -204,7 +204,7 @@ def test_info_reports_the_end_and_the_last_observation(levels: Level, keys, acti
         fresh = np.asarray(done)
         np.testing.assert_array_equal(np.moveaxis(np.asarray(after.level.state.position), 0, -1)[..., fresh],
                                       start[..., fresh])  # fmt: skip
-        assert_same(seen_next[~fresh], seen[~fresh])
+        assert_same(observed_next[~fresh], observed[~fresh])
         ends += np.asarray(info["terminated"]).sum(), np.asarray(info["truncated"]).sum()
         state = after
     assert (ends > 0).all(), ends
@@ -228,17 +228,17 @@ OBSERVATIONS = [pytest.param(kind, marks=pytest.mark.campaign if kind in MORE el
 @pytest.mark.parametrize("observation_type", OBSERVATIONS)
 def test_observations_lie_in_their_space(levels: Level, observation_type: str) -> None:
     env, params = make(levels, observation_type=observation_type)
-    seen, state = env.reset(jax.random.key(0), params)
+    observed, state = env.reset(jax.random.key(0), params)
     space = env.observation_space(params)
     shapes = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)
     if isinstance(space, Dict):
-        assert space.contains(seen)
-        seen = vars(seen)
-        assert {name: (x.shape, x.dtype) for name, x in space.spaces.items()} == shapes(seen)
+        assert space.contains(observed)
+        observed = vars(observed)
+        assert {name: (x.shape, x.dtype) for name, x in space.spaces.items()} == shapes(observed)
     else:
-        assert (space.shape, space.dtype) == shapes(seen)
-    assert space.contains(seen)
-    assert shapes(space.sample(jax.random.key(1))) == shapes(seen)
+        assert (space.shape, space.dtype) == shapes(observed)
+    assert space.contains(observed)
+    assert shapes(space.sample(jax.random.key(1))) == shapes(observed)
     assert shapes(jax.eval_shape(env.get_obs, state)) == shapes(env.reset(jax.random.key(0), params)[0])
 
 
@@ -314,8 +314,8 @@ def test_environment_works_for_sizes_without_some_kinds(size: Size) -> None:
     env, params = make(sample_levels(np.arange(3), size))
     keys = jax.random.split(jax.random.key(0), 3)
     _, state = jax.vmap(env.reset, (0, None))(keys, params)
-    seen, state, reward, done, _ = jax.vmap(env.step, (0, 0, 0, None))(keys, state, jnp.ones((3, 6), int), params)
-    assert seen.shape == (3, *env.observation_space(params).shape)
+    observed, state, reward, done, _ = jax.vmap(env.step, (0, 0, 0, None))(keys, state, jnp.ones((3, 6), int), params)
+    assert observed.shape == (3, *env.observation_space(params).shape)
     assert reward.shape == done.shape == (3,)
     assert np.isfinite(state.now.state.position).all()
 
@@ -325,7 +325,7 @@ def test_gradients_do_not_flow_through_the_world(levels: Level) -> None:
     _, state = env.reset(jax.random.key(0), params)
 
     def reward(strength):
-        seen, _, reward, _, _ = env.step(jax.random.key(1), state, strength * jnp.ones(6), params)
-        return reward + seen.sum() + strength
+        observed, _, reward, _, _ = env.step(jax.random.key(1), state, strength * jnp.ones(6), params)
+        return reward + observed.sum() + strength
 
     assert jax.grad(reward)(0.5) == 1

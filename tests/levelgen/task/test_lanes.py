@@ -30,7 +30,7 @@ def test_lanes_step_as_mapped_environments_do(levels: Level) -> None:
     actions = np.random.default_rng(0).integers(0, np.array(CHOICES), (STEPS, COUNT, 6)).astype(np.int32)
     keys, one, fresh = jax.random.split(jax.random.key(0), COUNT), starts(levels), starts(levels)
     table = lanes.table(params)
-    seen, state, played = jax.jit(lanes.reset)(table, jnp.arange(COUNT)[::-1])
+    observed, state, played = jax.jit(lanes.reset)(table, jnp.arange(COUNT)[::-1])
     mapped, step = jax.jit(jax.vmap(env.step, (0, 0, 0, None, 0))), jax.jit(lanes.step)
     one = jax.tree.map(lambda x: x[::-1], one)
     ended = 0
@@ -38,11 +38,11 @@ def test_lanes_step_as_mapped_environments_do(levels: Level) -> None:
         chosen = np.roll(np.arange(COUNT), number)  # the levels that lanes start next
         given = jax.tree.map(lambda x, chosen=chosen: x[chosen], fresh)
         expected, one, reward, done, expected_info = mapped(keys, one, actions[number], params, given)
-        seen, state, played, *rest, info = step(table, played, state, actions[number].T, chosen)
+        observed, state, played, *rest, info = step(table, played, state, actions[number].T, chosen)
         jax.tree.map(np.testing.assert_array_equal, rest, [reward, done])
         jax.tree.map(np.testing.assert_array_equal, state.now, lanes_last(one.now))
         np.testing.assert_array_equal(state.level_index, one.level_index)
-        np.testing.assert_allclose(seen, expected.T, rtol=1e-6)
+        np.testing.assert_allclose(observed, expected.T, rtol=1e-6)
         np.testing.assert_allclose(info.pop("final_observation"), expected_info.pop("final_observation").T, rtol=1e-6)
         jax.tree.map(np.testing.assert_array_equal, info, expected_info)
         ended += int(done.sum())

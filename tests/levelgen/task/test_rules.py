@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from levelproof.levelgen.level import Level, Role
+from levelproof.levelgen.task.measures import goal_distance
 from levelproof.levelgen.task.rules import (
     NO_DISTANCE,
     TaskParams,
     TaskState,
     advance,
-    goal_distance,
     has_nan,
     has_roles,
     reset,
@@ -64,7 +64,7 @@ def as_level(sample: Golden, lanes) -> Level:
 @pytest.mark.slow
 @pytest.mark.parametrize("size", ["s", "m", "l"])
 class TestAgainstTheReference:
-    def test_reward_done_and_goal(self, size: str) -> None:
+    def test_reward_done_and_goal_equal_the_references(self, size: str) -> None:
         sample, (_, outcome) = golden(size), env_step(size)
         same = np.abs(outcome.reward - sample.reward) < 1e-4
         same &= (outcome.done == sample.done) & (outcome.goal == sample.goal)
@@ -81,7 +81,7 @@ class TestAgainstTheReference:
             worst = np.maximum(worst, gap.reshape(-1, gap.shape[-1]).max(0))
         assert (worst < 1e-3).mean() >= 0.99, np.sort(worst)[-10:]  # two physics steps
 
-    def test_clock_and_distance(self, size: str) -> None:
+    def test_clock_and_distance_equal_the_references(self, size: str) -> None:
         sample, (after, _) = golden(size), env_step(size)
         np.testing.assert_array_equal(after.timestep, sample.env_timestep)
         assert (np.abs(after.last_distance - sample.env_last_distance) < 1e-3).mean() >= 0.995

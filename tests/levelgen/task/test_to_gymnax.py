@@ -27,9 +27,9 @@ def test_wrapper_steps_as_the_installed_gymnax_does() -> None:
     assert isinstance(wrapped, base.Environment)
     keys, own = jax.random.split(jax.random.key(0), COUNT), starts(levels)
     action = jax.vmap(wrapped.action_space(params).sample)(keys)
-    seen, state, reward, *ends, info = jax.jit(jax.vmap(wrapped.step, (0, 0, 0, None)))(keys, own, action, params)
+    observed, state, reward, *ends, info = jax.jit(jax.vmap(wrapped.step, (0, 0, 0, None)))(keys, own, action, params)
     expected = jax.jit(jax.vmap(env.step, (0, 0, 0, None)))(keys, own, action, params)
-    jax.tree.map(np.testing.assert_array_equal, (seen, state, reward), expected[:3])
+    jax.tree.map(np.testing.assert_array_equal, (observed, state, reward), expected[:3])
     assert len(ends) == 1 + SPLITS_DONE
     np.testing.assert_array_equal(sum(ends), expected[3])
     np.testing.assert_array_equal(wrapped.is_truncated(own), np.zeros(COUNT))
@@ -65,6 +65,6 @@ def test_wrapper_spaces_are_gymnaxs(action_type: str, kind: str) -> None:
     assert space.contains(action)
     _, state = jax.eval_shape(env.reset, jax.random.key(0), params)
     jax.eval_shape(wrapped.step, jax.random.key(0), state, action, params)
-    seen = wrapped.observation_space(params)
-    assert type(seen) is spaces.Dict
-    assert all(np.isfinite(x).all() for x in seen.sample(jax.random.key(0)).values())
+    observation_space = wrapped.observation_space(params)
+    assert type(observation_space) is spaces.Dict
+    assert all(np.isfinite(x).all() for x in observation_space.sample(jax.random.key(0)).values())

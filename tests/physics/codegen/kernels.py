@@ -35,7 +35,7 @@ class Kernel:
 
     @functools.cached_property
     def _name(self) -> str:
-        """Compiled as `physics.step` compiles the step."""
+        """Name of the kernel, compiled as `physics.step` compiles the step."""
 
         def kernel(*arrays):
             self.body(*map(jax.new_ref, arrays))
@@ -44,7 +44,7 @@ class Kernel:
         return register(write(jaxpr, self.arguments, self.results, self.scratch))
 
     def as_machine_code(self, *arguments: np.ndarray) -> list[np.ndarray]:
-        """What it makes of arguments of some blocks of lanes."""
+        """Run the kernel as machine code on arguments of one or more blocks of lanes."""
         return [np.asarray(x) for x in self._machine_code(arguments)[:-1]]
 
     @functools.cached_property
@@ -57,7 +57,7 @@ class Kernel:
         return jax.jit(call)
 
     def as_xla(self, *arguments: np.ndarray) -> list[np.ndarray]:
-        """The same by XLA, block after block."""
+        """Run the kernel as XLA operations, block after block."""
         blocks = []
         for first in range(0, arguments[0].shape[-1], LANES):
             block = [

@@ -20,11 +20,10 @@ jax.config.update("jax_compilation_cache_dir", sys.argv[1])
 from llvmlite import binding
 emit, made = binding.TargetMachine.emit_object, []
 binding.TargetMachine.emit_object = lambda self, module: made.append(module) or emit(self, module)
-from levelproof.physics import step
-from levelproof.physics.codegen import kept
+from levelproof.physics.codegen import call, kept
 kept.BEGAN = float("inf")  # a source may have been edited a moment ago
-write, written = step.write, []
-step.write = lambda *given: written.append(given) or write(*given)
+write, written = call.write, []
+call.write = lambda *given: written.append(given) or write(*given)
 from tests.physics.test_machines import digest
 result = digest("s")
 print(len(written), len(made), result)
@@ -76,12 +75,11 @@ def test_cached_works_without_a_folder(folder: Path) -> None:
 
 
 @pytest.fixture
-def source(folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def source(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Replace the kernels' sources by one file, written long before this process began."""
     path = tmp_path_factory.mktemp("sources") / "one.py"
     path.write_text("source")
     os.utime(path, (0, 0))
-    monkeypatch.setattr(module, "SOURCES", path.parent)
     module._sources.cache_clear()
     yield path
     module._sources.cache_clear()
@@ -97,12 +95,12 @@ def test_cached_notices_changed_sources(source: Path) -> None:
     make, calls = made(b"code")
     for text, so_far in (("source", 1), ("source", 1), ("other", 2), ("source", 2)):
         changed(source, text, 0)
-        assert cached_by_sources("one", make) == b"code"
+        assert cached_by_sources("one", make, [source.parent]) == b"code"
         assert len(calls) == so_far
     source.rename(source.with_name("two.py"))
     module._sources.cache_clear()
-    cached_by_sources("one", make)
-    cached_by_sources("two", make)
+    cached_by_sources("one", make, [source.parent])
+    cached_by_sources("two", make, [source.parent])
     assert len(calls) == 4
 
 
@@ -110,6 +108,6 @@ def test_cached_stores_nothing_if_a_source_changed_since_the_start(source: Path,
     """The process may still run the previous version."""
     make, calls = made(b"code")
     changed(source, "source", module.BEGAN + 1)
-    assert [cached_by_sources("one", make) for _ in range(2)] == [b"code"] * 2
+    assert [cached_by_sources("one", make, [source.parent]) for _ in range(2)] == [b"code"] * 2
     assert len(calls) == 2
     assert not list(folder.iterdir())

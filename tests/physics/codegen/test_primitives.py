@@ -61,6 +61,8 @@ EXACT = {
     "square": lambda x, *_: jnp.square(x),
     "select_n": lambda x, y, z: lax.select_n(x < y, y, z),
     "where": lambda x, y, z: jnp.where(x == y, 1.0, z),
+    "fourth power": lambda x, *_: x**4,
+    "fifth power": lambda x, *_: x**5,
 }
 CHOSEN = {
     "max": lambda x, y, _: jnp.maximum(x, y),
@@ -88,6 +90,9 @@ INTEGER = {
     "square": lambda x, *_: jnp.square(x),
     "and": lambda x, y, _: x & y,
     "or": lambda x, y, _: x | y,
+    "xor": lambda x, y, _: x ^ y,
+    "shift left": lambda x, *_: lax.shift_left(x, jnp.full_like(x, 13)) | lax.shift_left(x, jnp.full_like(x, 31)),
+    "shift right": lambda x, *_: lax.shift_right_logical(x, jnp.full_like(x, 1)),
     "not": lambda x, *_: ~x,
     "select_n": lambda x, y, z: lax.select_n(x < y, y, z),
     "reduce_max": lambda *xs: jnp.stack(xs).max(0),
@@ -98,6 +103,7 @@ INTEGER = {
 LOGICAL = COMPARED | {
     "and": lambda x, y, _: x & y,
     "or": lambda x, y, _: x | y,
+    "xor": lambda x, y, _: x ^ y,
     "not": lambda x, *_: ~x,
     "max": lambda x, y, _: jnp.maximum(x, y),
     "min": lambda x, y, _: jnp.minimum(x, y),
@@ -132,33 +138,48 @@ class TestNumbers:
         self.check(self.INTEGERS, x)
         self.check(self.COMPARED_INTEGERS, x)
 
-    def test_awkward_floats(self) -> None:
+    def test_awkward_floats_equal_xla(self) -> None:
         self.check_floats(every_pair(AWKWARD))
 
-    def test_awkward_integers(self) -> None:
+    def test_awkward_integers_equal_xla(self) -> None:
         self.check_integers(every_pair(AWKWARD_INTS))
 
-    def test_bools(self) -> None:
+    def test_bools_equal_xla(self) -> None:
         self.check(self.BOOLS, np.arange(3 * LANES).reshape(3, LANES) // np.array([[1], [2], [4]]) % 2 == 1)
 
     @some
     @given(rows(floats, np.float32))
-    def test_floats(self, x) -> None:
+    def test_random_floats_equal_xla(self, x) -> None:
         self.check_floats(x)
 
     @some
     @given(rows(ints | st.integers(-4, 4), np.int32))
-    def test_integers(self, x) -> None:
+    def test_random_integers_equal_xla(self, x) -> None:
         self.check_integers(x)
 
 
 class TestConversions:
     @pytest.mark.parametrize(("source", "target"), [("int32", "float32"), ("bool", "float32"), ("bool", "int32")])
-    def test_are_exact_or_to_the_nearest_float(self, source: str, target: str) -> None:
+    def test_conversions_are_exact_or_to_the_nearest_float(self, source: str, target: str) -> None:
         x = every_pair(AWKWARD_INTS)
         TestNumbers.check(
             table({"convert": lambda x, *_: x.astype(target)}, source, target), x if source == "int32" else x > 0
         )
+
+    def test_floats_are_cut_to_integers_as_by_xla(self) -> None:
+        """Towards zero; NaN to 0; beyond the range to the nearest integer."""
+        TestNumbers.check(
+            table({"convert": lambda x, *_: x.astype(jnp.int32)}, "float32", "int32"), every_pair(AWKWARD)
+        )
+
+    @pytest.mark.parametrize(
+        ("source", "target", "x"), [("int32", "float32", AWKWARD_INTS), ("float32", "int32", AWKWARD)]
+    )
+    def test_bits_are_read_as_another_type(self, source: str, target: str, x: np.ndarray) -> None:
+        read = lambda x, *_: lax.bitcast_convert_type(x, jnp.dtype(target))
+        kernel = table({"bits": read}, source, target)
+        ours = kernel.as_machine_code(every_pair(x))[0][0]
+        np.testing.assert_array_equal(ours.view(np.int32), every_pair(x)[0].view(np.int32))
 
 
 def shape_cases() -> dict[str, Callable]:
@@ -196,7 +217,7 @@ def shape_cases() -> dict[str, Callable]:
 
 
 @pytest.mark.parametrize("name", shape_cases())
-def test_shapes(name: str) -> None:
+def test_shape_primitives_equal_xla(name: str) -> None:
     case = shape_cases()[name]
     x = np.random.default_rng(2).uniform(-1, 1, (6, 2 * LANES)).astype(np.float32)
     n = np.random.default_rng(3).integers(-9, 9, (4, 2 * LANES), np.int32)

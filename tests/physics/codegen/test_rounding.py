@@ -1,29 +1,24 @@
 """Kernels round the same way on every thread and processor, and restore the thread's mode."""
 
 import ctypes
-import re
 import threading
 from collections.abc import Callable
 
-import jax
 import numpy as np
 import pytest
-from llvmlite import binding, ir
+from llvmlite import ir
 
 from levelproof.physics.block import Inputs
 from levelproof.physics.buffers import buffers_of
 from levelproof.physics.codegen import compile as compile_module
 from levelproof.physics.codegen import ffi
 from levelproof.physics.codegen.buffers import LANES, Buffer
-from levelproof.physics.codegen.compile import write
 from levelproof.physics.codegen.rounding import set_mode
-from levelproof.physics.step import block_buffers, trace
+from levelproof.physics.step import kernel_of
 from levelproof.physics.types import Params
+from tests import arm
 from tests.physics.codegen.kernels import Kernel
 from tests.physics.worlds import ROOM
-
-TARGETS = {"aarch64-unknown-linux-gnu": "neoverse-v1", "arm64-apple-darwin": "apple-m1"}
-FUSED = r"\bf(?:n?madd|n?msub|mla|mls|nmla|nmls)\b"
 
 
 def body(x, one, out) -> None:
@@ -73,23 +68,9 @@ def test_kernel_leaves_the_mode_of_its_thread_as_it_was() -> None:
     assert np.float32(1e-20) * np.float32(1e-20) != 0
 
 
-@pytest.mark.parametrize("triple", TARGETS)
-def test_arm_code_sets_the_mode_and_fuses_nothing(triple: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without an ARM processor: the whole step compiles, and its assembly has the expected instructions."""
-    binding.initialize_all_targets()
-    binding.initialize_all_asmprinters()
-    monkeypatch.setattr(binding, "get_default_triple", lambda: triple)
-    buffers = block_buffers(ROOM, Params(), False, buffers_of(Inputs, ROOM))
-    reads, table, results, scratch = map(jax.tree.leaves, buffers)
-    module = binding.parse_assembly(write(trace(buffers, Params()), [*reads, *table], results, scratch))
-    target = binding.Target.from_triple(triple).create_target_machine(cpu=TARGETS[triple], opt=3, jit=True)
-    passes = binding.create_pass_builder(target, binding.create_pipeline_tuning_options(speed_level=2))
-    passes.getModulePassManager().run(module, passes)
-    assembly = target.emit_assembly(module)
-    assert not re.findall(FUSED, assembly)
-    assert len(re.findall(r"\bmsr\s+FPCR", assembly)) == 2
-    called = set(re.findall(r"\bbl\s+_?(\w+)", assembly))
-    assert called <= {"blocks", "block", "memset", "memcpy", "bzero"}, "the process must have what a kernel calls"
+@pytest.mark.parametrize("triple", arm.TARGETS)
+def test_arm_code_of_the_step_sets_the_mode_and_fuses_nothing(triple: str) -> None:
+    arm.assert_portable(kernel_of(ROOM, Params(), False, buffers_of(Inputs, ROOM)), triple)
 
 
 def test_kernel_for_an_unknown_processor_is_refused() -> None:

@@ -13,7 +13,9 @@ from typing import NoReturn
 import pytest
 
 from levelproof.pipeline.cli import main
+from levelproof.pipeline.jobs.inline import HERE
 from levelproof.pipeline.store import seal
+from levelproof.pipeline.store.event_files import events_of, runs_in
 from levelproof.pipeline.store.layout import data_paths
 from levelproof.pipeline.store.locks import only_writer
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
@@ -27,9 +29,11 @@ COMMANDS = [command.__name__.rpartition(".")[2].rstrip("_") for command in main.
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a real, tiny split `data/5k/s`, which tests must not change."""
     folder = tmp_path_factory.mktemp("made")
-    done = here(["generate", *TINY, "executor=inline"], folder)
+    done = here(["generate", *TINY], folder)
     assert done.returncode == 0, done.stderr
     assert "4/4 levels" in done.stderr
+    (events,) = map(events_of, runs_in(folder / "data/5k/s"))
+    assert [*events[-1]["workers"]] == [HERE], "so small a job starts no workers"
     return folder
 
 
@@ -60,10 +64,10 @@ def test_help_answers_at_once_and_lists_every_command(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_help_with_an_example(tmp_path: Path, command: str) -> None:
-    done = run([command, "--help"], tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert re.search(rf"examples?:\s+levelproof {command} ", done.stdout)
+def test_every_command_has_help_with_an_example(capsys: pytest.CaptureFixture[str], command: str) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        main.main([command, "--help"])
+    assert re.search(rf"examples?:\s+levelproof {command} ", capsys.readouterr().out)
 
 
 def test_version_prints_the_version(tmp_path: Path) -> None:
@@ -92,10 +96,10 @@ def test_generate_rejects_a_wrong_setting_in_one_sentence(
 
 
 @pytest.mark.parametrize("arguments", [[], ["generat"], ["inspect"], ["show"], ["inspect", "x", "--rows", "a"]])
-def test_invalid_command_prints_the_usage(tmp_path: Path, arguments: list[str]) -> None:
-    done = run(arguments, tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.startswith("usage: levelproof")
+def test_invalid_command_prints_the_usage(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main.main(arguments)
+    assert capsys.readouterr().err.startswith("usage: levelproof")
 
 
 @pytest.mark.parametrize(
@@ -158,7 +162,7 @@ def test_debug_shows_the_traceback(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_generate_does_nothing_when_all_levels_exist(made: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in made.rglob("*") if path.suffix in (".parquet", ".zarr")}
-    done = here(["generate", *TINY, "executor=inline"], made)
+    done = here(["generate", *TINY], made)
     assert done.returncode == 0
     assert "Nothing to do: 4 levels there already" in done.stdout
     assert "levelproof inspect data/5k/s" in done.stdout
@@ -234,7 +238,7 @@ def test_status_shows_the_progress_of_a_split(split: Path) -> None:
     fragment_paths(split)[0].unlink()
     text = here(["status", "data/5k/s"], split.parents[2]).stdout
     assert "3 of 4 levels committed" in text
-    assert "To resume: levelproof generate levels=4 unit=1 budget=5k executor=inline" in text
+    assert "To resume: levelproof generate levels=4 unit=1 budget=5k\n" in text
 
 
 @pytest.mark.slow

@@ -33,13 +33,13 @@ def run() -> int:
         set_up()
         campaign = Campaign(Path(name), server)
         for schedule in schedules:
-            begun = cpu_seconds()
+            start = cpu_seconds()
             try:
                 missed += not campaign.run(schedule)
             except Exception:
                 failed += 1
                 print(f"FAILED {schedule}\n{traceback.format_exc(limit=-3)}\n", flush=True)
-            print(f"{schedule} ({cpu_seconds() - begun:.1f} s of a core)", flush=True)
+            print(f"{schedule} ({cpu_seconds() - start:.1f} s of a core)", flush=True)
     print(table(schedules))
     print(f"{len(schedules)} schedules, {failed} failed; in {missed} the command ended before its fault.")
     return bool(failed)

@@ -183,7 +183,7 @@ def _counted(shared: memoryview, role: int, tell: Tell | None) -> Tell:
 
 
 def _tell(happening: Happening, control: socket.socket, shared: memoryview) -> Tell:
-    """Return the function that causes the fault in the process that is about to have its effect."""
+    """Return a function that causes the fault in the process that is about to cause the chosen effect."""
     fault, _, at, when = happening
     code = next((code for name, code in ERRORS.items() if name in fault), 0)
 

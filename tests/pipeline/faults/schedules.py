@@ -84,9 +84,9 @@ def _cells() -> list[tuple[str, str, str, str]]:
     for name, operation in OPERATIONS.items():
         for place, faults in (("folder", OF_PROCESSES), ("store", OF_STORES if name in STORED else {})):
             for fault, processes in faults.items():
-                of = [who for who in processes if operation.works or who != "worker"]
+                hit = [who for who in processes if operation.works or who != "worker"]
                 often = OFTEN.get(fault, 1) * (1 if operation.works else 2) if place == "folder" else 1
-                cells += [(name, place, fault, who) for who in of] * often
+                cells += [(name, place, fault, who) for who in hit] * often
     random.Random(0).shuffle(cells)
     return cells
 
@@ -103,12 +103,12 @@ def table(schedules: Iterable[Schedule]) -> str:
     """Return a Markdown table of the number of schedules by fault and operation."""
     schedules = list(schedules)
     columns = list(dict.fromkeys((name, place) for place in ("folder", "store") for name in OPERATIONS))
-    columns = [of for of in columns if of[1] == "folder" or of[0] in STORED]
-    count = Counter((of.fault, of.operation, of.place) for of in schedules)
+    columns = [(name, place) for name, place in columns if place == "folder" or name in STORED]
+    count = Counter((schedule.fault, schedule.operation, schedule.place) for schedule in schedules)
     heads = [name + (" (store)" if place == "store" else "") for name, place in columns]
     lines = [f"| fault | {' | '.join(heads)} | all |", "|---|" + "---|" * (len(heads) + 1)]
     for fault in dict.fromkeys([*OF_PROCESSES, *OF_STORES]):
-        row = [count[fault, *of] for of in columns]
+        row = [count[fault, *column] for column in columns]
         lines.append(f"| {fault} | {' | '.join(str(n or '') for n in row)} | {sum(row)} |")
-    totals = [sum((of.operation, of.place) == column for of in schedules) for column in columns]
+    totals = [sum((one.operation, one.place) == column for one in schedules) for column in columns]
     return "\n".join([*lines, f"| all | {' | '.join(map(str, totals))} | {len(schedules)} |"])

@@ -13,6 +13,7 @@ from tests.pipeline.command import ROOT
 from tests.pipeline.faults.effects import lose_power
 
 EACH = 65
+FIRST, SOME = 10_000, 8  # these run by default
 
 
 def run(first: int, count: int) -> None:
@@ -24,13 +25,13 @@ def run(first: int, count: int) -> None:
 
 
 def test_some_fault_schedules_change_nothing() -> None:
-    run(10_000, 20)
+    run(FIRST, SOME)
 
 
 def test_lose_power_ignores_a_half_written_log_line(tmp_path: Path) -> None:
     log, kept, gone = tmp_path / "log", tmp_path / "kept", tmp_path / "gone"
     line = lambda path: f"\nwrite\t{path}\t{path}\t\tFalse\twhole"
-    seen = set()
+    outcomes = set()
     for end in range(len(line(kept)) + 1):
         kept.write_text("kept")
         gone.write_text("gone")
@@ -38,11 +39,16 @@ def test_lose_power_ignores_a_half_written_log_line(tmp_path: Path) -> None:
         for seed in range(8):
             lose_power(log, seed)
         assert not gone.exists()
-        seen |= {(end, kept.exists())}
-    assert seen == {(end, end < len(line(kept))) for end in range(len(line(kept)) + 1)}
+        outcomes |= {(end, kept.exists())}
+    assert outcomes == {(end, end < len(line(kept))) for end in range(len(line(kept)) + 1)}
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("first", range(0, 8 * EACH, EACH))
 def test_five_hundred_fault_schedules_change_nothing(first: int) -> None:
     run(first, EACH)
+
+
+@pytest.mark.campaign
+def test_further_fault_schedules_change_nothing() -> None:
+    run(FIRST + SOME, 12)

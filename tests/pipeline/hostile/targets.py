@@ -52,7 +52,7 @@ from levelproof.pipeline.store import bounds, hub, remote
 from levelproof.pipeline.store.checkpoints import load_experts, save_experts
 from levelproof.pipeline.store.contents import check_numbers, table_for
 from levelproof.pipeline.store.fields import arrays_of
-from levelproof.pipeline.store.formats import CONFIG_KEY, HASH_KEY, Encoding
+from levelproof.pipeline.store.formats import Encoding
 from levelproof.pipeline.store.job_note import NoteError, note_job, read_note
 from levelproof.pipeline.store.layout import BEGUN, DATA, FRAGMENT, JOB, MANIFEST, entries
 from levelproof.pipeline.store.manifest import changes_text, differences, fragment_paths, read_fragment, read_manifest
@@ -68,6 +68,8 @@ from tests.pipeline.hostile.mutations import (
     random_value,
     remove,
 )
+from tests.pipeline.hostile.seeds import seeds
+from tests.pipeline.hostile.tables import mutate_parquet
 from tests.pipeline.made import made_job, made_split, played_split
 from tests.pipeline.read.kinetix.folder import GOLDEN
 
@@ -213,58 +215,13 @@ def fragments(folder: Path) -> Target:
     split = made_split(folder, [[Label.SOLVED, Label.UNSOLVED, Label.SOLVED]])
     (path,) = fragment_paths(split)
     data, table = path.read_bytes(), pq.read_table(path)
-    metadata = table.schema.metadata
-    long = pa.concat_tables([table] * 20)
     in_groups = BytesIO()
-    pq.write_table(long, in_groups, row_group_size=7, write_page_checksum=True)
+    pq.write_table(pa.concat_tables([table] * 20), in_groups, row_group_size=7, write_page_checksum=True)
     bodies = [data, in_groups.getvalue()]
-
-    def mutated(random: Random) -> bytes:
-        match random.randrange(8):
-            case 0 | 1:
-                return mutate_bytes(random.choice(bodies), random)
-            case 2 | 3:  # the footer
-                body = random.choice(bodies)
-                start = len(body) - 8 - int.from_bytes(body[-8:-4], "little")
-                footer = mutate_bytes(body[start:-8], random)
-                return body[:start] + footer + len(footer).to_bytes(4, "little") + b"PAR1"
-            case 4:  # pages
-                body = bytearray(random.choice(bodies))
-                for _ in range(random.choice((1, 2, 10))):
-                    body[random.randrange(4, len(body) - 8)] = random.choice(
-                        (0, 1, 127, 128, 255, random.randrange(256))
-                    )
-                return bytes(body)
-            case 5 | 6:  # metadata
-                about = dict(metadata)
-                key = random.choice([key for key in about if not key.startswith(b"ARROW")])
-                try:
-                    about[key] = mutate_json(json.loads(about[key]), random)[:2_000_000]
-                except ValueError:
-                    about[key] = mutate_bytes(about[key], random)
-                if key == CONFIG_KEY and random.random() < 0.5:
-                    about[HASH_KEY] = _hash_like(about[CONFIG_KEY])
-                changed = table.replace_schema_metadata(about)
-            case _:  # rows
-                i = random.randrange(table.num_columns)
-                field = table.schema.field(i)
-                values = table.column(i).to_pylist()
-                values[random.randrange(3)] = random_value(random)
-                try:
-                    column = pa.array(values, field.type)
-                except Exception:
-                    column = pa.array(values[:0] + [None] * 3, field.type)
-                changed = table.set_column(i, field.with_nullable(field.nullable or column.null_count > 0), column)
-        sink = BytesIO()
-        try:
-            pq.write_table(changed, sink, write_page_checksum=random.random() < 0.5)
-        except pa.ArrowException:  # Arrow cannot write this table
-            return mutate_bytes(data, random)
-        return sink.getvalue()
 
     def target(random: Random) -> None:
         remove(path)
-        put(path, mutated(random), random)
+        put(path, mutate_parquet(bodies, table, {}, random), random)
         checked = {**bounds.READ_OPTIONS, "page_checksum_verification": random.random() < 0.3}
         with patch.object(bounds, "READ_OPTIONS", checked):
             if path.is_symlink() or not path.is_file():
@@ -278,15 +235,6 @@ def fragments(folder: Path) -> Target:
             assert set(found.labels) <= {*Label}
 
     return target
-
-
-def _hash_like(config: bytes) -> bytes:
-    from levelproof.configs.schema import hash_of
-
-    try:
-        return hash_of(json.loads(config)).encode()
-    except (ValueError, RecursionError):
-        return b"?"
 
 
 def notes(folder: Path) -> Target:
@@ -490,6 +438,7 @@ TARGETS: dict[str, Callable[[Path], Target]] = {
     "shards, resume": partial(shards, density="resume"),
     "shards, witness": partial(shards, density="witness"),
     "fragments": fragments,
+    "seeds": seeds,
     "notes and marks": notes,
     "origins": origins,
     "checkpoints": checkpoints,

@@ -29,7 +29,7 @@ from tests.pipeline.command import COMMAND_SECONDS, ROOT, assert_refused, descen
 from tests.pipeline.made import lasting, made_job
 
 LEVELS, DEADLY = 8, 2
-SETTINGS = ("generate", f"levels={LEVELS}", "unit=1", "budget=5k")
+SETTINGS = ("generate", f"levels={LEVELS}", "unit=1", "budget=5k", "executor=ray")
 SPLIT = Path("data/5k/s")
 MEMORY: dict[str, Any] = {"object_store_memory": 80 * 2**20}  # of a node of Ray
 STALLED = 150  # s; longer than compiling keeps a worker of a fast machine silent
@@ -291,6 +291,24 @@ def test_crew_hands_on_the_units_of_workers_on_a_refused_machine(monkeypatch: py
     assert [*scheduler.workers] == [elsewhere]
 
 
+def test_crew_starts_thousands_of_workers_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that a signal to stop waits for no more than a part."""
+    handles = [cluster.WorkerHandle("a", "a") for _ in range(3000)]
+
+    def start(handle: cluster.WorkerHandle, *_: Any) -> None:
+        time.sleep(0.01)  # as long as Ray takes
+        handle.actor = "started"
+
+    monkeypatch.setattr(cluster.WorkerHandle, "start", start)
+    monkeypatch.setattr(cluster, "STARTING", 0.1)
+    monkeypatch.setattr(cluster.ray, "cluster_resources", dict)
+    scheduler = Scheduler([WorkUnit(range(10_000))], 10_000)
+    crew = cluster.Crew(made_job("data", "unit=1"), SPLIT, scheduler, Board(Tally(1, 0, 0), Console()))
+    crew._handles = handles
+    counts = [crew.start_workers() or sum(handle.starting for handle in handles) for _ in range(2)]
+    assert 0 < counts[0] < counts[1] < len(handles) / 10
+
+
 def test_mismatch_names_what_differs() -> None:
     job = made_job()
     program = program_of(job)
@@ -344,7 +362,7 @@ def test_run_survives_machines_that_join_and_leave(tmp_path: Path, machines: Any
     (note,) = (tmp_path / "data/8k/s/quarantine").iterdir()
     assert f"The experts in {tmp_path / SPLIT / trained['experts']} cannot be read" in note.read_text()
 
-    own = run(["generate", "levels=1", "budget=5k", "out=own"], tmp_path)
+    own = run(["generate", "levels=1", "budget=5k", "out=own", "executor=ray"], tmp_path)
     assert own.returncode == 0, own.stderr  # it ignores a cluster that RAY_ADDRESS does not name
 
 
@@ -385,7 +403,7 @@ def test_ray_exports_progress_to_prometheus(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_crew_replaces_a_stalled_worker(tmp_path: Path) -> None:
     alone = ("search.env_steps=0", "stop.rule=budget")  # so that experts train long
-    command = ["generate", f"levels={LEVELS}", "unit=1", "budget=1M", "workers=1", *alone]
+    command = ["generate", f"levels={LEVELS}", "unit=1", "budget=1M", "workers=1", "executor=ray", *alone]
     process = start([str(LEVELS), str(patience(STALLED)), *command], tmp_path, module="tests.pipeline.fragile")
     split, busy = tmp_path / "data/1M/s", "ray::Fragile.work"
     working = lambda: [pid for pid in descendants(process.pid) if title(pid).startswith(busy)]

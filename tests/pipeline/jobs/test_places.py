@@ -18,7 +18,7 @@ from tests.pipeline.command import COMMAND_SECONDS, ROOT
 
 NEED = 2 * GB
 
-# A machine with two cores, memory for one worker, and a GPU that an actor holds
+# A machine with two cores, memory for one worker, which tells what Ray reserves for it, and a GPU that an actor holds
 HELD = """
 import ray
 from levelproof.configs.compose import compose_job
@@ -29,6 +29,11 @@ from levelproof.pipeline.jobs.progress import Board, Tally
 from levelproof.pipeline.jobs.schedule import Scheduler
 from levelproof.pipeline.runtime import NO_GPU
 
+class Telling(cluster.WorkerActor):
+    def begin(self, *_):
+        return str(ray.get_runtime_context().get_assigned_resources().get("memory"))
+
+cluster.WorkerActor = Telling
 ray.init(address="local", include_dashboard=False, num_cpus=2, num_gpus=1, _memory=2 * 10**9, log_to_driver=False)
 Holder = ray.remote(num_cpus=0, num_gpus=1)(type("Holder", (), {"there": lambda self: True}))
 holder = Holder.remote()
@@ -44,6 +49,10 @@ assert len(crew._handles) == 1, crew._handles
 gpu, memory = said
 assert gpu == "Workers use CPU cores, not GPUs: after 1 s of waiting, others still hold all of them.", gpu
 assert memory.endswith("has 2.0 GB of memory free, and a worker of this size needs 1.5 GB: it runs 1 of 2 workers.")
+crew.start_workers()
+reserved = ray.get(crew._handles[0].answer, timeout=600.0)
+assert reserved == str(1.5 * 10**9), reserved
+crew._handles[0].end()
 cluster.GPU_PATIENCE = 600.0
 ray.kill(holder)
 assert cluster._why_no_gpu() == NO_GPU  # it is free, but JAX cannot use it

@@ -56,6 +56,18 @@ def test_board_estimates_exclude_compiling() -> None:
     assert text.getvalue().endswith("800 env steps/s · about 69 s left\n")  # (64 - 8.8) / 0.8
 
 
+def test_board_counts_programs_while_they_compile() -> None:
+    now = tally()
+    board, text = board_at(now, [0.0])
+    now.compiled = 7, 19
+    board.refresh(0.0)
+    now.compiled = 19, 19
+    board.refresh(0.0)
+    first, second = text.getvalue().splitlines()
+    assert first.endswith("compiling, 7 of 19 programs")
+    assert second.endswith("compiling")
+
+
 def test_board_pace_excludes_levels_of_earlier_runs() -> None:
     now = tally(done=32)
     assert now.share == 0.5

@@ -83,7 +83,7 @@ def test_undisturbed_run_commits_every_level(undisturbed: Path) -> None:
 
 @pytest.mark.campaign
 def test_number_of_workers_changes_no_result(undisturbed: Path, tmp_path: Path) -> None:
-    done = run(COMMAND, tmp_path)
+    done = run([*COMMAND, "executor=ray"], tmp_path)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
     assert_same_content(tmp_path / SPLIT, undisturbed)
@@ -116,7 +116,7 @@ def test_run_with_a_killed_worker_stops_and_continues_to_the_same_bits(
     undisturbed: Path, tmp_path: Path, number: signal.Signals
 ) -> None:
     """Another worker takes over the dead one's units, and is busy when the run is stopped. All listen on loopback."""
-    process = start([*COMMAND, ALONE], tmp_path, preexec_fn=heed_ctrl_c)
+    process = start([*COMMAND, ALONE, "executor=ray"], tmp_path, preexec_fn=heed_ctrl_c)
     until(lambda: fragment_paths(tmp_path / SPLIT), process)
     places = listening(descendants(process.pid))
     assert places

@@ -58,6 +58,7 @@ def failing(work: Any, error: Exception, unit: WorkUnit | None = None, after: in
 
 def test_worker_commits_a_row_for_every_level(tmp_path: Path, job: JobConfig) -> None:
     worker = Worker(job, tmp_path)
+    worker.compiling = 1e4  # s, before the first unit
     rounds = [worker.work(Order(UNITS), 0.0)]
     while rounds[-1].totals:
         rounds.append(worker.work(Order([]), 0.1))
@@ -81,6 +82,7 @@ def test_worker_commits_a_row_for_every_level(tmp_path: Path, job: JobConfig) ->
         assert sum(getattr(summary.seconds, stage) for summary in summaries) == pytest.approx(
             sum(cost[stage] for cost in costs), rel=1e-4
         )
+    assert 9_999 < sum(cost["compiling"] for cost in costs) < 2e4  # rows hold float32
     for row, cost in zip(manifest.table.to_pylist(), costs, strict=True):
         assert min(cost.values()) >= 0 < min(cost["sampling"], cost["replay"], cost["writing"])
         assert (cost["training"] > 0) == (row["env_steps"] > 0)

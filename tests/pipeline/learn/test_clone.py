@@ -1,17 +1,20 @@
 """Cloning of a policy from a small real split, and continuing after a real kill."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import is_dataclass
+from dataclasses import is_dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
 import levelproof
 from levelproof.configs.clone import CloneConfig
@@ -19,17 +22,26 @@ from levelproof.configs.compose import override_of
 from levelproof.configs.convert import plain
 from levelproof.configs.meanings import comments_in
 from levelproof.experts.config import RECORD_STEPS
-from levelproof.experts.imitation import ImitationConfig
-from levelproof.experts.networks.over_levels import NetworkConfig
+from levelproof.experts.imitation import ImitationConfig, from_motion
+from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind
 from levelproof.levelgen.level import ACTIONS
+from levelproof.levelgen.mirror import mirror
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.pipeline.learn import clone as module
-from levelproof.pipeline.learn.metrics import STEP
+from levelproof.pipeline.learn import sealed
+from levelproof.pipeline.learn.clone import COURSE
+from levelproof.pipeline.learn.curves import draw_curves
+from levelproof.pipeline.learn.pool import read_pool
+from levelproof.pipeline.learn.sealed import SEALED
+from levelproof.pipeline.runtime import CACHE_VARIABLE
+from levelproof.pipeline.store.locks import only_clone
 from tests.pipeline.command import ROOT, assert_refused, here
 from tests.pipeline.made import played_split
+from tests.quick import jit_once
 
 SETTINGS = ("interval=20", "train.batch=128", "validation=0.3", "where=", "network.width=16", "network.depth=1")
+UPDATES = "train.updates=200"  # static in the programs, so other numbers of updates compile them again
 
 
 def cloned(folder: Path, split: Path, *words: str) -> Path:
@@ -45,15 +57,29 @@ def metrics(out: Path) -> list[dict[str, float]]:
 
 @pytest.fixture(scope="module")
 def policy(split: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return cloned(tmp_path_factory.mktemp("cloned"), split, "train.updates=200", "where=label = 'solved'")
+    return cloned(tmp_path_factory.mktemp("cloned"), split, UPDATES, "where=label = 'solved'")
 
 
 def test_loss_falls(policy: Path) -> None:
     curve = metrics(policy)
-    assert [numbers[STEP] for numbers in curve] == list(range(20, 201, 20))
+    assert [numbers[COURSE.step] for numbers in curve] == list(range(20, 201, 20))
     assert curve[-1]["bc/loss"] < 0.6 * curve[0]["bc/loss"]
     assert curve[-1]["bc/accuracy"] > 0.75
     assert {"bc/validation_loss", "bc/validation_accuracy", "bc/samples_per_second"} <= set(curve[-1])
+
+
+def test_curves_are_drawn_beside_the_policy(policy: Path, tmp_path: Path) -> None:
+    with Image.open(policy / "curves.png") as picture:
+        shown = {tuple(colour) for colour in np.asarray(picture.convert("RGB")).reshape(-1, 3).tolist()}
+    assert {(62, 176, 92), (58, 124, 220)} <= shown, "a line of training and one of validation"
+    draw_curves(metrics(policy), COURSE, tmp_path / "again.png")
+    assert (tmp_path / "again.png").read_bytes() == (policy / "curves.png").read_bytes()
+
+
+def test_curve_of_one_point_is_drawn(policy: Path, tmp_path: Path) -> None:
+    draw_curves(metrics(policy)[:1], COURSE, tmp_path / "one.png")
+    draw_curves([], COURSE, tmp_path / "none.png")
+    assert (tmp_path / "one.png").read_bytes() != (tmp_path / "none.png").read_bytes()
 
 
 def solve_share(levels: levelproof.Level, choose) -> float:
@@ -64,9 +90,12 @@ def solve_share(levels: levelproof.Level, choose) -> float:
         world, result = task.advance(levels, world, choose(key, world), task.DEFAULT_RULES)
         return (world, open_ & ~result.done, won | (open_ & result.goal)), None
 
-    start = task.reset(levels), jnp.ones(len(levels), bool), jnp.zeros(len(levels), bool)
-    (_, _, won), _ = jax.lax.scan(act, start, jax.random.split(jax.random.key(0), RECORD_STEPS))
-    return float(won.mean())
+    @jit_once
+    def play(keys):
+        start = task.reset(levels), jnp.ones(len(levels), bool), jnp.zeros(len(levels), bool)
+        return jax.lax.scan(act, start, keys)[0][2].mean()
+
+    return float(play(jax.random.split(jax.random.key(0), RECORD_STEPS)))
 
 
 def test_policy_beats_random_play_on_levels_it_was_trained_on(policy: Path, split: Path) -> None:
@@ -81,7 +110,7 @@ def test_policy_beats_random_play_on_levels_it_was_trained_on(policy: Path, spli
 
 @pytest.mark.slow
 def test_run_that_was_killed_continues_bit_for_bit(split: Path, tmp_path: Path) -> None:
-    words = ["train.updates=120", "pool=8", "refresh=7"]  # several rounds of levels
+    words = [UPDATES, "pool=8", "refresh=7"]  # several rounds of levels
     (tmp_path / "whole").mkdir()
     whole = cloned(tmp_path / "whole", split, *words)
     out = tmp_path / "policy"
@@ -95,22 +124,21 @@ def test_run_that_was_killed_continues_bit_for_bit(split: Path, tmp_path: Path) 
     for name in ("policy.safetensors", "checkpoint.safetensors", "config.json"):
         assert (out / name).read_bytes() == (whole / name).read_bytes()
     losses = [[numbers["bc/loss"] for numbers in metrics(folder)] for folder in (whole, out)]
-    assert len(losses[1]) == 6
+    assert len(losses[1]) == 10
     assert losses[0][-3:] == losses[1][-3:]
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_splits_of_several_sizes_make_one_policy(split: Path, tmp_path: Path) -> None:
-    larger = played_split(tmp_path / "larger", size="m")
-    out = cloned(
-        tmp_path, split, str(larger), "train.updates=20", "network.kind=invariant", "episodes=all", "log=tensorboard"
-    )
+    """The network is that of `policy`, so that only the programs of the larger size are compiled."""
+    larger = played_split(tmp_path / "larger", held=8, size="m")
+    out = cloned(tmp_path, split, str(larger), UPDATES, "episodes=all", "log=tensorboard")
     assert list((out / "log").glob("*/events*"))
     assert {f"bc/validation_loss/{path}" for path in (split, larger)} <= set(metrics(out)[-1])
     policy = levelproof.load_policy(out)
     for size in "sm":
         levels = levelproof.sample_levels(np.arange(2), size)
-        assert jax.jit(policy.logits)(levels, levels.state).shape == (sum(CHOICES), 2)
+        assert jit_once(policy.logits)(levels, levels.state).shape == (sum(CHOICES), 2)
     done = here(["clone", str(split), str(larger), "network.kind=flat", "where="], tmp_path)
     assert_refused(done, 2, "levels of one size")
 
@@ -123,10 +151,82 @@ def test_bad_input_is_refused(split: Path, policy: Path, tmp_path: Path, monkeyp
     assert_refused(here(["clone", str(tmp_path / "none")], tmp_path), 2, "none")
     with pytest.raises(levelproof.PolicyError, match="There is no policy in"):
         levelproof.load_policy(tmp_path)
+    (tmp_path / "file").touch()
+    assert_refused(here(["clone", str(split), "-o", "file"], tmp_path), 2, "Cannot write a policy to file")
     first = int(levelproof.open(split).manifest["level_id"][0].as_py())
-    monkeypatch.setattr(module, "SEALED", range(first, first + 2))
+    monkeypatch.setattr(sealed, "SEALED", range(first, first + 2))
     with pytest.raises(levelproof.UserError, match="sealed"):
-        module.source_of(split, CloneConfig(where=""))
+        module.source_of(split, CloneConfig(where=""), print)
+
+
+def test_transformer_learns_from_states_with_their_contacts(split: Path) -> None:
+    config = CloneConfig(where="", network=NetworkConfig(PolicyKind.TRANSFORMER))
+    data = module.source_of(split, config, print).data
+    pool = read_pool(data, np.arange(2), config)
+    state = from_motion(pool.motion[pool.first[1] :], data.size)
+    stored = data.read([1], fields=["record/state"], observation=None).fields
+    steps = int(pool.steps[1])
+    contacts = stored["record/state/contact_active"][0, :steps]
+    assert contacts.any()
+    np.testing.assert_array_equal(np.asarray(state.contact_active).T, contacts)
+    np.testing.assert_array_equal(
+        np.moveaxis(np.asarray(state.position), -1, 0), stored["record/state/position"][0, :steps]
+    )
+
+
+def test_pool_has_the_mirror_images_that_solve(split: Path) -> None:
+    config = CloneConfig(where="label = 'solved'", mirror=True)
+    data = module.source_of(split, replace(config, validation=0.3), print).data
+    plain_pool, pool = (read_pool(data, np.arange(len(data)), each) for each in (replace(config, mirror=False), config))
+    count = len(plain_pool.steps)
+    assert 1.5 * count < len(pool.steps) <= 2 * count
+    assert len(pool.level) == len(pool.steps)
+    for name in ("motion", "action"):
+        np.testing.assert_array_equal(getattr(pool, name)[: len(plain_pool.motion)], getattr(plain_pool, name))
+    image = from_motion(pool.motion[pool.first[count:]], data.size)
+    starts = np.asarray(mirror(data.levels(np.arange(len(data)))).state.position)
+    for lane in range(len(pool.steps) - count):
+        same = np.abs(starts - np.asarray(image.position)[..., lane : lane + 1]).max((0, 1)) == 0
+        assert same.any()
+
+
+def test_second_clone_is_refused_where_one_runs(split: Path, tmp_path: Path) -> None:
+    (tmp_path / "policy").mkdir()
+    with only_clone(tmp_path / "policy"):
+        assert_refused(here(["clone", str(split), "where="], tmp_path), 2, "Another command is writing")
+    assert not (tmp_path / "policy" / "run.json").exists()
+
+
+def test_clone_writes_nothing_to_a_folder_that_was_made_again(
+    split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, validated = tmp_path / "policy", module.validated
+
+    def made_again(*arguments: Any) -> dict[str, float]:
+        shutil.rmtree(out)
+        out.mkdir()
+        return validated(*arguments)
+
+    monkeypatch.setattr(module, "validated", made_again)
+    done = here(["clone", str(split), *SETTINGS, UPDATES], tmp_path)
+    assert_refused(done, 1, "policy was removed or recreated")
+    assert not list(out.iterdir())
+
+
+def test_copies_of_sealed_levels_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    copies, said = played_split(tmp_path / "copies", copies=SEALED[-16:]), []
+    for _ in range(2):  # hashed, then from the cache folder
+        source = module.source_of(copies, CloneConfig(where="", validation=0.5), said.append)
+        others = np.flatnonzero(source.data.manifest["level_id"].to_numpy() >= 16)
+        assert 1 < source.copies == len(source.data) - len(others)
+        assert sorted([*source.train, *source.validation]) == others.tolist()
+        assert f"{source.copies} levels left out" in said.pop()
+        monkeypatch.setattr("levelproof.pipeline.learn.sealed.content_hashes", None)
+    (kept,) = (tmp_path / "cache" / "sealed").iterdir()
+    kept.write_text("[]")
+    with pytest.raises(TypeError):
+        module.source_of(copies, CloneConfig(where=""), print)
 
 
 def test_guide_lists_every_setting_with_its_default_and_meaning() -> None:

@@ -16,9 +16,10 @@ from levelproof.pipeline.cli.main import main
 from levelproof.pipeline.look import card as cards
 from levelproof.pipeline.look.figures import Share
 from levelproof.pipeline.look.preview import PICTURES, PIXELS, SHOWN
-from levelproof.pipeline.look.readme import CardOptions, SplitFacts, readme
+from levelproof.pipeline.look.readme import MARK, CardOptions, SplitFacts, readme
 from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.made import made_split, played_split
+from tests.pipeline.planted import PLANTED, no_hang
 
 pytestmark = pytest.mark.slow
 
@@ -147,9 +148,9 @@ def test_python_in_the_card_runs(dataset: Path, tmp_path: Path, monkeypatch: pyt
     (tmp_path / "data").symlink_to(dataset)
     monkeypatch.chdir(tmp_path)
     (block,) = re.findall(r"^```python\n(.*?)^```", (dataset / "README.md").read_text(), re.DOTALL | re.MULTILINE)
-    seen: dict[str, Any] = {}
-    exec(compile(block, "README.md", "exec"), seen)
-    assert seen["batch"].observation.shape[:2] == (64, 256)
+    names: dict[str, Any] = {}
+    exec(compile(block, "README.md", "exec"), names)
+    assert names["batch"].observation.shape[:2] == (64, 256)
 
 
 @pytest.mark.parametrize("name", ["README.md", "preview", "preview/128k-s.parquet", "figures/solved.svg"])
@@ -162,3 +163,16 @@ def test_card_refuses_to_write_through_links(tmp_path: Path, name: str) -> None:
     link.symlink_to(mine)
     assert main(["card", str(split)]) == 2
     assert not [*mine.iterdir()] if mine.is_dir() else mine.read_text() == "mine"
+
+
+@pytest.mark.parametrize("kind", ["hard link", "pipe"])
+@pytest.mark.parametrize("name", ["README.md", "preview/128k-s.parquet", "figures/solved.svg"])
+def test_card_refuses_hard_links_and_pipes(tmp_path: Path, name: str, kind: str) -> None:
+    split = made_split(tmp_path / "levels", [[Label.UNSOLVED]])
+    mine, path = tmp_path / "mine", tmp_path / "levels" / name
+    mine.write_text(text := f"mine {MARK}")
+    path.parent.mkdir(exist_ok=True)
+    PLANTED[kind](path, mine)
+    with no_hang():
+        assert main(["card", str(split)]) == 2
+    assert mine.read_text() == text

@@ -9,7 +9,11 @@ import jax
 import numpy as np
 import pytest
 
+from levelproof.experts.evaluation import play, play_sampled
+from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy
+from levelproof.experts.networks.saved import Policy, load_policy, save_policy
 from levelproof.experts.witness.witness import steps_to_goal
+from levelproof.levelgen.level import SIZES
 from levelproof.pipeline.cli.gallery import MAX_LEVELS
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.look.entities import count_entities
@@ -18,7 +22,7 @@ from levelproof.pipeline.look.gallery.gallery import BLOCK, gallery
 from levelproof.pipeline.look.gallery.pages import FLAGS, NOTHING, NUMBERS
 from levelproof.pipeline.look.gallery.worlds import ANGLE, LENGTH, angles
 from levelproof.pipeline.look.reasons import kind_of_reason
-from levelproof.pipeline.read.levels import levels_of
+from levelproof.pipeline.read.levels import levels_of, rules_of
 from levelproof.pipeline.read.rows import read_row
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 from tests.pipeline.made import PLAYED
@@ -58,7 +62,7 @@ def test_gallery_columns_equal_the_manifests(site: Path, manifest: Manifest) -> 
         np.testing.assert_array_equal(found, table[name].to_numpy().astype(float))
     for name in ("label", "label_reason", "witness", *FLAGS):
         words = {NOTHING: None} | dict(enumerate(columns[name]["words"]))
-        found = [words[place] for place in numbers(page[name], "<u2")]
+        found = [words[index] for index in numbers(page[name], "<u2")]
         if name in FLAGS:
             found = [None if word is None else word == "yes" for word in found]
         assert found == [kind_of_reason(x) if name == "label_reason" else x for x in table[name].to_pylist()]
@@ -122,6 +126,42 @@ def test_world_has_every_body_joint_and_thruster(site: Path, manifest: Manifest)
         assert sorted(body[:2] for body in found) == sorted((levels.role[body, lane], corners[body]) for body in active)
         assert sorted(body[2] for body in found) == pytest.approx(sorted(positions[active, 0]), abs=0.01)
         assert len(world) == 5 * joints + 5 * thrusters
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder, network = tmp_path_factory.mktemp("policy"), NetworkConfig(PolicyKind.INVARIANT, width=8, depth=1)
+    params = jax.jit(initial_policy, static_argnums=(1, 2))(jax.random.key(0), network, SIZES["s"])
+    save_policy(folder, Policy(network, params, None, {}))
+    return folder
+
+
+def test_policy_plays_every_level_as_evaluations_do(
+    split: Path, manifest: Manifest, policy: Path, tmp_path: Path
+) -> None:
+    gallery(split, tmp_path / "site", None, MAX_LEVELS, policy)
+    levels, ids = levels_of(manifest, manifest.table), manifest.table["level_id"].to_numpy()
+    loaded = load_policy(policy)
+    played = play(play_sampled(loaded.network), loaded.params, levels, ids, 1, 0, rules_of(manifest))
+    about, page = data(tmp_path / "site", "about"), data(tmp_path / "site", "columns/0")
+    (words,) = [column["words"] for column in about["columns"] if column["name"] == "policy"]
+    found = [words[index] for index in numbers(page["policy"], "<u2")]
+    assert found == ["solves" if solved else "fails" for solved in played.solved[:, 0]]
+    assert set(found) == {"solves", "fails"}
+    for number, level_id in enumerate(ids.tolist()):
+        attempt = data(tmp_path / "site", f"levels/0/{level_id}")["policy"]
+        assert attempt["solved"] == played.solved[number, 0]
+        assert len(numbers(attempt["actions"], "u1")) == 6 * played.env_steps[number, 0]
+
+
+def test_policy_of_another_size_is_refused(split: Path, tmp_path: Path) -> None:
+    network = NetworkConfig(PolicyKind.FLAT, width=8, depth=1)
+    params = jax.jit(initial_policy, static_argnums=(1, 2))(jax.random.key(0), network, SIZES["m"])
+    save_policy(tmp_path, Policy(network, params, SIZES["m"], {}))
+    with pytest.raises(UserError, match="plays levels of size m only"):
+        gallery(split, tmp_path / "site", None, 1, tmp_path)
+    with pytest.raises(UserError, match="There is no policy in"):
+        gallery(split, tmp_path / "site", None, 1, tmp_path / "none")
 
 
 def test_angles_wrap_to_one_turn() -> None:

@@ -6,11 +6,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
 from benchmarks.browser import browser
+from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy
+from levelproof.experts.networks.saved import Policy, save_policy
 from levelproof.experts.witness.witness import steps_to_goal
+from levelproof.levelgen.level import SIZES
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.look.gallery.gallery import gallery
 from levelproof.pipeline.look.gallery.worlds import ANGLE, LENGTH
@@ -156,6 +160,27 @@ def test_level_page_plays_the_record(page: Any, address: str, split: Path) -> No
     assert page.locator("#command").inner_text().startswith("levelproof generate")
     assert page.locator("#reason").inner_text() == "Made for a test."
     assert "to 50%" in page.locator("#curve").get_attribute("aria-label")
+    assert page.evaluate(UNNAMED) == []
+
+
+def test_level_page_plays_a_policy_beside_the_witness(page: Any, split: Path, tmp_path: Path) -> None:
+    network = NetworkConfig(PolicyKind.INVARIANT, width=8, depth=1)
+    params = jax.jit(initial_policy, static_argnums=(1, 2))(jax.random.key(0), network, SIZES["s"])
+    save_policy(tmp_path / "policy", Policy(network, params, None, {}))
+    gallery(split, tmp_path / "site", None, PLAYED, tmp_path / "policy")
+    page.goto((tmp_path / "site" / "index.html").as_uri())
+    wait_until_drawn(page)
+    page.get_by_role("button", name=re.compile("^fails")).click()
+    assert 0 < int(page.locator("#count").inner_text().split(" of ")[0]) < PLAYED
+    page.goto(f"{(tmp_path / 'site' / 'index.html').as_uri()}#level={solved(split)}")
+    page.wait_for_selector("#policy-words:has-text('Policy: ')")
+    assert page.locator("#stage-words").inner_text().startswith("Witness: ")
+    both = [page.locator(f"#{stage}") for stage in ("stage", "policy-stage")]
+    starts = [stage.evaluate("(canvas) => canvas.toDataURL()") for stage in both]
+    page.keyboard.press("End")
+    ends = [stage.evaluate("(canvas) => canvas.toDataURL()") for stage in both]
+    assert starts[0] != ends[0]
+    assert starts[1] != ends[1]
     assert page.evaluate(UNNAMED) == []
 
 

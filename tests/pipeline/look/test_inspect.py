@@ -15,6 +15,7 @@ from PIL import Image
 from rich.console import Console
 
 from levelproof.experts.labels import Cause, Label, unsolved_reason
+from levelproof.levelgen.identity.keys import SAMPLER_VERSION
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.pipeline.errors import Failure, UserError
@@ -122,7 +123,7 @@ def test_write_csv_writes_all_rows(split: Path, monkeypatch: pytest.MonkeyPatch)
     assert [int(row["level_id"]) for row in read] == [11, 10, 8, 7, 6, 4, 3, 2, 0]
     assert list(read[0]) == COLUMNS.names
     assert json.loads(read[0]["learning_curve"]) == [None, 0.5]
-    assert json.loads(read[0]["versions"])["sampler"] == 1
+    assert json.loads(read[0]["versions"])["sampler"] == SAMPLER_VERSION
     assert (read[0]["witness"], read[2]["witness"], read[2]["steps_to_goal"]) == ("", "sampled", "17")
     write_csv(split, RowQuery(columns=["row", "label"], limit=1), text := io.StringIO())
     assert text.getvalue() == "row,label\n0,solved\n"

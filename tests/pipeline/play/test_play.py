@@ -9,20 +9,26 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from levelproof.experts.config import RECORD_STEPS, StopConfig
+from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy
+from levelproof.experts.networks.saved import Policy
 from levelproof.experts.search.config import SearchConfig
 from levelproof.experts.witness.witness import replay, succeeds
 from levelproof.levelgen.files.level_file import from_document, write_level_file
+from levelproof.levelgen.level import SIZES
+from levelproof.physics.types import Size
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.look.gallery.attempts import Contender
 from levelproof.pipeline.play import training
 from levelproof.pipeline.play.open import level_to_play
 from levelproof.pipeline.play.server import HOST, serving
-from levelproof.pipeline.play.session import empty_file
+from levelproof.pipeline.play.session import Session, empty_file
 from levelproof.pipeline.store.manifest import require_manifest
 from tests.experts.small import untouched
 from tests.pace import patience
@@ -47,6 +53,12 @@ def page(address: str) -> Iterator[ClientConnection]:
     limits = {"max_size": 2**26, "open_timeout": patience(10)}
     with connect(f"{address.replace('http', 'ws')}/socket", origin=address, **limits) as connection:  # pyright: ignore[reportArgumentType]
         yield connection
+
+
+def random_policy(size: Size | None) -> Policy:
+    network = NetworkConfig(PolicyKind.INVARIANT, width=8, depth=1)
+    params = jax.jit(initial_policy, static_argnums=(1, 2))(jax.random.key(0), network, SIZES["s"])
+    return Policy(network, params, size, {})
 
 
 def ask(page: ClientConnection, request: str, /, **fields: Any) -> dict[str, Any]:
@@ -124,6 +136,31 @@ def test_train_request_streams_progress(page: ClientConnection, monkeypatch: pyt
     assert ask(page, "play")["actions"] == film["actions"]
 
 
+def test_policy_attempts_are_played_from_the_start(split: Path) -> None:
+    """Another attempt each time; a success is the level's witness, as if the user had played it."""
+    row = next(row for row in require_manifest(split).table.to_pylist() if row["shard"])
+    file, _ = level_to_play(split, row["level_id"], "m")
+    session = Session(file, None, Contender(random_policy(None), 1))
+    assert session.level({})["policy"]
+    films = [session.attempt({}) for _ in range(8)]
+    assert len({json.dumps(film["actions"]) for film in films}) > 1
+    for film in films:
+        assert session.restart({})["places"] == film["places"][0]
+        moments = [session.step({"action": action}) for action in film["actions"]]
+        assert [moment["places"] for moment in moments] == film["places"][1:]
+        assert [moment["done"] for moment in moments] == [False] * (len(moments) - 1) + [True]
+        assert moments[-1]["goal"] == film["goal"]
+    assert ("error" not in session.answer({"ask": "play"})) == any(film["goal"] for film in films)
+
+
+@pytest.mark.parametrize("contender", [None, "of another size"])
+def test_page_without_a_policy_for_its_level_says_so(contender: str | None) -> None:
+    policy = Contender(random_policy(SIZES["s"]), 1) if contender else None
+    session = Session(empty_file("m"), None, policy)
+    assert not session.level({})["policy"]
+    assert "--policy" in session.answer({"ask": "attempt"})["error"]
+
+
 def test_server_refuses_other_origins_and_hosts(address: str) -> None:
     with pytest.raises(InvalidStatus, match="403"):
         connect(f"{address.replace('http', 'ws')}/socket", origin="http://example.com")  # pyright: ignore[reportArgumentType]
@@ -138,6 +175,8 @@ def test_server_refuses_other_origins_and_hosts(address: str) -> None:
 def test_play_refuses_unplayable_arguments(split: Path, tmp_path: Path, address: str) -> None:
     assert_refused(here(["play", str(tmp_path / "none.json")], tmp_path), 2, "none.json")
     assert_refused(here(["play", str(split)], tmp_path), 2, "Add its id")
+    assert_refused(here(["play", "--policy", "none"], tmp_path), 2, "There is no policy in none")
+    assert_refused(here(["play", "--policy", "builtin:x"], tmp_path), 2, "no policy builtin:x", "comes with builtin:s")
     assert_refused(here(["play", "--size", "giant"], tmp_path), 2, "giant")
     assert_refused(here(["play", "--port", address.rpartition(":")[2]], tmp_path), 2, "--port")
     assert_refused(here(["play", "--port", "65536"], tmp_path), 2, "port 65536", "must be 0-65535", "--port")

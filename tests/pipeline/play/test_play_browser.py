@@ -8,11 +8,12 @@ from typing import Any
 import pytest
 
 from levelproof.levelgen.files.level_file import from_document
+from levelproof.pipeline.look.gallery.attempts import Contender
 from levelproof.pipeline.play.server import HOST, serving
 from levelproof.pipeline.play.session import empty_file
 from tests.pace import patience
 from tests.pipeline.look.test_gallery_browser import UNNAMED, chromium, patient
-from tests.pipeline.play.test_play import QUICK
+from tests.pipeline.play.test_play import QUICK, random_policy
 
 __all__ = ["chromium"]  # a fixture
 pytestmark = pytest.mark.campaign
@@ -21,7 +22,7 @@ VIEW, BORDER, TOP = 5.16, 0.08, 5.08  # m; the canvas shows -BORDER to TOP
 
 @pytest.fixture
 def page(chromium: Any) -> Iterator[Any]:
-    with serving(empty_file("m"), None, QUICK, 20_000, 0) as server:
+    with serving(empty_file("m"), None, QUICK, 20_000, 0, Contender(random_policy(None), 1)) as server:
         opened = patient(chromium.new_page(viewport={"width": 1280, "height": 900}, accept_downloads=True))
         opened.failures = []
         opened.on("pageerror", lambda error: opened.failures.append(str(error)))
@@ -82,6 +83,10 @@ def test_page_builds_edits_plays_and_saves_a_level(page: Any, tmp_path: Path) ->
     assert len(document["witness"]["actions"]) > 3
     assert sorted(from_document(document).level.role[4:].ravel().tolist())[-2:] == [1, 2]
 
+    button(page, "Let the policy play")
+    page.wait_for_function(
+        "document.querySelector('#outcome').textContent.startsWith('The policy')", timeout=1000 * patience(60)
+    )
     button(page, "Watch")
     page.wait_for_function("document.querySelector('#outcome').textContent.startsWith('The witness reaches')")
     button(page, "Undo")

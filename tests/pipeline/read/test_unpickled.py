@@ -1,4 +1,4 @@
-"""Unpickling: no reader of splits or folders does it."""
+"""Readers of splits and folders never unpickle data."""
 
 import _pickle
 import pickle

@@ -23,7 +23,7 @@ from levelproof.pipeline.store.thrift import footer_in, pages_in
 from tests.pipeline.command import ROOT
 from tests.pipeline.made import made_split
 
-MOST = 100 * 2**20  # bytes that reading all of them may take beyond those of reading a good one
+MOST = 100 * 2**20  # bytes of memory that reading all hostile files may take beyond those of a good one
 PEAK = """
 import json, resource, sys
 from pathlib import Path
@@ -132,10 +132,10 @@ HOSTILE = {
     long_texts: "its rows would take more memory than those of any fragment",
     long_pages: "its rows would take more memory than those of any fragment",
     long_hashes: "its rows would take more memory than those of any fragment",
-    shortened_hashes: "strings of it are not encoded as they were written",
+    shortened_hashes: "a column's strings are not encoded as this program writes them",
     long_lists: "its rows would take more memory than those of any fragment",
     many_rows: "it has more rows than any fragment of its size",
-    other_values: "a column has not one value per row",
+    other_values: "a column does not have one value per row",
 }
 
 
@@ -187,13 +187,13 @@ def test_footer_in_and_pages_in_agree_with_arrow(good: Path) -> None:
     assert (footer.rows, footer.made_by) == (about.num_rows, about.created_by)
     for group, columns in enumerate(footer.groups):
         for i, column in enumerate(columns.columns):
-            of = about.row_group(group).column(i)
-            assert column.values == of.num_values
-            assert column.length == of.total_compressed_size
-            assert column.first == min(filter(None, (of.data_page_offset, of.dictionary_page_offset)))
+            expected = about.row_group(group).column(i)
+            assert column.values == expected.num_values
+            assert column.length == expected.total_compressed_size
+            assert column.first == min(filter(None, (expected.data_page_offset, expected.dictionary_page_offset)))
             pages = list(pages_in(data[column.first : column.first + column.length]))
-            assert sum(page.values for page in pages if not page.is_dictionary) == of.num_values
-            assert sum(page.bytes for page in pages) <= of.total_uncompressed_size
+            assert sum(page.values for page in pages if not page.is_dictionary) == expected.num_values
+            assert sum(page.bytes for page in pages) <= expected.total_uncompressed_size
 
 
 def test_read_fragment_accepts_no_rows(good: Path, tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ def test_fragments_with_digests_are_plain_parquet(split: Path) -> None:
 
 
 def test_fragments_have_the_digests_of_their_shards(split: Path) -> None:
-    """And `sha256sum` agrees."""
+    """`sha256sum` computes the same ones."""
     fragment, rows = read_fragment(*fragment_paths(split))
     name = rows.column("shard")[0].as_py()
     shard = data_path(split, name)

@@ -68,7 +68,7 @@ def write(folder: Path, encoding: Encoding, fields: dict[str, np.ndarray] | None
 
 
 @pytest.fixture(autouse=True)
-def silence_is_wanted() -> Iterator[None]:
+def engine_warnings_fail_tests() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("error", EngineDiffers)
         yield
@@ -99,7 +99,7 @@ def test_played_records_cover_the_difficult_cases() -> None:
 
 @pytest.mark.parametrize("encoding", [Encoding("resume"), WITNESS, Encoding("witness", 8), Encoding("witness", 256)])
 def test_every_density_restores_every_bit(tmp_path: Path, encoding: Encoding) -> None:
-    """And a full shard written from the result has the same files as the original."""
+    """A full shard written from the result has the same files as the original."""
     full, other = write(tmp_path, Encoding()), write(tmp_path, encoding)
     assert Shard(other.path).encoding == encoding
     assert_same(other.read(), played())
@@ -114,7 +114,7 @@ def files(shard: Path) -> dict[str, bytes]:
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("size", ["m", "l"])
-@pytest.mark.parametrize("encoding", [Encoding("resume"), WITNESS], ids=lambda of: of.density)
+@pytest.mark.parametrize("encoding", [Encoding("resume"), WITNESS], ids=lambda encoding: encoding.density)
 def test_every_density_restores_every_bit_of_larger_levels(tmp_path: Path, size: str, encoding: Encoding) -> None:
     assert_same(write(tmp_path, encoding, played(size)).read(), played(size))
 
@@ -260,7 +260,7 @@ def test_timesteps_follow_from_episode_ends() -> None:
 
 @pytest.mark.parametrize("density", ["resume", "witness"])
 def test_write_shard_refuses_records_that_cannot_be_recomputed(tmp_path: Path, density: Any) -> None:
-    """Such as a record of another machine, or a changed one."""
+    """Such records come from another machine, or have been changed."""
     fields = {name: x.copy() for name, x in played().items()}
     fields["record/reward"][200, 2] += 1
     with pytest.raises(Failure, match=f"cannot recompute record/reward of level 12, .*density={density} leaves"):
@@ -278,19 +278,19 @@ def test_read_recomputes_with_the_shards_rules(tmp_path: Path) -> None:
 
 
 ABOUT: dict[str, dict[str, Any]] = {
-    "another density": {"density": "full"},
-    "the other density": {"density": "resume"},
-    "no density": {"density": "dense"},
-    "no word": {"density": ["witness"]},
-    "another k": {"key_every": 16},
-    "no k": {"key_every": 0},
-    "half a k": {"key_every": 32.0},
-    "no number": {"key_every": "32"},
-    "k beyond the record": {"key_every": 512},
-    "a task that never ends": {"task": {"frame_skip": 10**9}},
-    "a task of another type": {"task": {"frame_skip": "2"}},
-    "a task that is none": {"task": 7},
-    "a task with more": {"task": {"gravity": 1.0}},
+    "density full": {"density": "full"},
+    "density resume": {"density": "resume"},
+    "unknown density": {"density": "dense"},
+    "density in a list": {"density": ["witness"]},
+    "another key_every": {"key_every": 16},
+    "key_every 0": {"key_every": 0},
+    "key_every as a float": {"key_every": 32.0},
+    "key_every as a string": {"key_every": "32"},
+    "key_every beyond the record": {"key_every": 512},
+    "env steps that never end": {"task": {"frame_skip": 10**9}},
+    "frame_skip as a string": {"task": {"frame_skip": "2"}},
+    "task that is a number": {"task": 7},
+    "task with an unknown setting": {"task": {"gravity": 1.0}},
 }
 
 
@@ -327,7 +327,7 @@ def test_shard_refuses_arrays_of_wrong_shapes(witness: Path, tmp_path: Path) -> 
             Shard(path).read(fields=["record/action"])
 
 
-def test_read_ends_for_senseless_states(tmp_path: Path) -> None:
+def test_read_terminates_on_impossible_states(tmp_path: Path) -> None:
     """Numbers that no engine produces, in key frames too."""
 
     def change(stored: dict[str, np.ndarray]) -> None:
@@ -373,7 +373,7 @@ def test_state_fields_match_those_of_records() -> None:
 
 
 def test_convert_writes_a_few_levels_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the order of places, from any densities."""
+    """It keeps the order of the places, whatever the densities of their shards."""
     monkeypatch.setattr(seal, "CONVERTED", 2)
     witness, full = write(tmp_path, WITNESS), write(tmp_path, Encoding())
     places = [Place(shard.path, row, IDS[row]) for shard, row in ((full, 0), (witness, 1), (witness, 2))]

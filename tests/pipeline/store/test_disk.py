@@ -1,4 +1,4 @@
-"""Writes to a full disk fail alike everywhere; flushing."""
+"""Failed writes are explained, and flushes reach the drive."""
 
 import errno
 import fcntl
@@ -106,7 +106,7 @@ def test_write_fragment_fails_on_a_full_disk(tiny: Path) -> None:
     assert not paths.fragment.exists()
 
 
-@pytest.mark.parametrize("has_it", [True, False], ids=["the file system can", "it cannot"])
+@pytest.mark.parametrize("has_it", [True, False], ids=["supported", "unsupported"])
 def test_flush_reaches_the_drive_on_macos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_it: bool) -> None:
     """Emulates on Linux what macOS has in addition."""
     flushed: dict[str, set[Path]] = {"drive": set(), "fsync": set()}

@@ -20,7 +20,8 @@ from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.contents import table_for
 from levelproof.pipeline.store.layout import data_path
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
-from levelproof.pipeline.store.shard import Shard, open_shard, stored_bytes, write_shard
+from levelproof.pipeline.store.named import open_shard
+from levelproof.pipeline.store.shard import Shard, stored_bytes, write_shard
 from tests.pipeline.made import made_fields, made_split
 
 LEVELS = [5, 9, 12]
@@ -55,13 +56,13 @@ def field(table: list[dict[str, Any]], name: str) -> dict[str, Any]:
 
 FIELDS: dict[str, Callable[[list[dict[str, Any]]], Any]] = {
     "type": lambda table: field(table, "level/role").update(dtype="float64"),
-    "no type": lambda table: field(table, "level/role").update(dtype="object"),
+    "object type": lambda table: field(table, "level/role").update(dtype="object"),
     "larger": lambda table: field(table, "record/state/position").update(shape=[200, 2]),
     "huge": lambda table: field(table, "record/state/position").update(shape=[2**40, 2**40]),
     "negative": lambda table: field(table, "record/state/position").update(shape=[-7, -2]),
     "flat": lambda table: field(table, "level/model/vertices").update(shape=[40]),
-    "no list": lambda table: field(table, "level/model/vertices").update(shape=7),
-    "behind the end": lambda table: field(table, "record/reward").update(first=10**9),
+    "shape that is a number": lambda table: field(table, "level/model/vertices").update(shape=7),
+    "beyond the end": lambda table: field(table, "record/reward").update(first=10**9),
     "before the start": lambda table: field(table, "record/reward").update(first=-1),
     "another array": lambda table: field(table, "level/role").update(array="lvl32"),
     "no array": lambda table: field(table, "level/role").update(array="../../secret"),
@@ -73,8 +74,8 @@ FIELDS: dict[str, Callable[[list[dict[str, Any]]], Any]] = {
     "a thousand bodies": lambda table: field(table, "level/model/radius").update(shape=[1000]),
     "no scenery": lambda table: field(table, "level/model/n_vertices").update(shape=[2]),
     "one circle more": lambda table: field(table, "level/model/radius").update(shape=[3]),
-    "none": lambda table: table.clear(),
-    "no table": lambda table: table.insert(0, 7),  # type: ignore[arg-type]
+    "empty table": lambda table: table.clear(),
+    "entry that is a number": lambda table: table.insert(0, 7),  # type: ignore[arg-type]
 }
 
 
@@ -309,15 +310,15 @@ def test_commands_do_not_leave_the_split(tmp_path: Path, capsys: pytest.CaptureF
         pq.write_table(changed, path, write_page_checksum=True)
         for words in (["inspect", str(split)], ["show", str(split), "0", "-o", str(tmp_path / "level.png")]):
             assert main(words) == 1
-            told = capsys.readouterr()
-            assert told.out == ""
-            (sentence,) = told.err.splitlines()
+            printed = capsys.readouterr()
+            assert printed.out == ""
+            (sentence,) = printed.err.splitlines()
             assert "which can be neither a shard nor experts of this split" in sentence
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [np.nan, np.inf, -3e38])
-def test_pictures_draw_or_refuse_senseless_states(tmp_path: Path, number: float) -> None:
+def test_pictures_draw_or_refuse_impossible_states(tmp_path: Path, number: float) -> None:
     split = made_split(tmp_path, [[Label.SOLVED]])
     (name,) = read_manifest(split).shards
     shard = Shard(split / name)

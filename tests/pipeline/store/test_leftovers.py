@@ -56,7 +56,7 @@ def test_commit_skips_levels_of_an_unreported_commit(tmp_path: Path) -> None:
         commit(made_job(), tmp_path, WorkUnit(tuple(ids)), made_result(ids, [Label.SOLVED] * len(ids)))
     assert clean(tmp_path, said.append).level_ids.tolist() == [0, 1, 2, 3]
     assert [path.stem for path in fragment_paths(tmp_path)] == [unit_name(0, 3), unit_name(1, 2)]
-    assert not said, "a shard that nobody names"
+    assert not said, "a shard that no fragment names"
 
 
 def everything(split: Path) -> set[Path]:

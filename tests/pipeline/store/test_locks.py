@@ -14,13 +14,20 @@ from typing import Any
 
 import pytest
 
-from levelproof.pipeline.errors import Exit, UserError
+from levelproof.pipeline.errors import Exit, Failure, UserError
 from levelproof.pipeline.jobs.schedule import Order, UnitOutcome, WorkUnit
 from levelproof.pipeline.jobs.worker import Worker
 from levelproof.pipeline.store import leases, locks
 from levelproof.pipeline.store.layout import COMMIT_LOCK
 from levelproof.pipeline.store.leases import LeaseLost
-from levelproof.pipeline.store.locks import LockRefused, committing, is_written, only_writer, without_commits
+from levelproof.pipeline.store.locks import (
+    LockRefused,
+    committing,
+    is_written,
+    only_clone,
+    only_writer,
+    without_commits,
+)
 from levelproof.pipeline.store.split import writing
 from tests.pace import patience
 from tests.pipeline.command import ROOT, heed_ctrl_c, start
@@ -50,6 +57,21 @@ def test_committing_refuses_workers_of_an_earlier_writer(tmp_path: Path, monkeyp
                 pass
         shutil.rmtree(tmp_path)
         tmp_path.mkdir()
+
+
+def test_only_clone_notices_that_its_folder_was_recreated(tmp_path: Path) -> None:
+    folder = tmp_path / "policy"
+    folder.mkdir()
+    with only_clone(folder) as require_ours:
+        require_ours()
+        shutil.rmtree(folder)
+        with pytest.raises(Failure, match="policy was removed"):
+            require_ours()
+        folder.mkdir()
+        with only_clone(folder) as theirs:
+            theirs()
+            with pytest.raises(Failure, match="removed or recreated"):
+                require_ours()
 
 
 # NFS implements `flock` by byte-range locks; so does this process, which holds one until its input ends
@@ -132,10 +154,10 @@ def test_without_commits_reports_its_wait_and_can_be_stopped(tmp_path: Path) -> 
     with committing(split):
         process = start(["generate", "budget=5k", "executor=inline"], tmp_path, preexec_fn=heed_ctrl_c)
         assert process.stderr is not None
-        told = process.stderr.readline()
-        assert "Waiting for a worker of an earlier run" in told
-        assert f"data/5k/s/{COMMIT_LOCK}" in told
-        assert "fuser" in told
+        message = process.stderr.readline()
+        assert "Waiting for a worker of an earlier run" in message
+        assert f"data/5k/s/{COMMIT_LOCK}" in message
+        assert "fuser" in message
         os.killpg(process.pid, signal.SIGINT)
         _, err = process.communicate(timeout=patience(60))
     assert process.returncode == Exit.INTERRUPTED

@@ -20,6 +20,8 @@ from levelproof.pipeline.errors import StoreFailure
 from levelproof.pipeline.store import paused as store
 from levelproof.pipeline.store.checkpoints import begun_like
 from levelproof.pipeline.store.layout import checkpoint_path, unit_name
+from levelproof.pipeline.store.leases import LeaseLost, serve, served
+from levelproof.pipeline.store.locks import only_writer
 from levelproof.pipeline.store.paused import CheckpointUnread, drop_paused, load_paused, prune_paused, save_paused
 from tests.pipeline.made import made_job
 from tests.pipeline.servers import Server, serving_bucket
@@ -113,6 +115,18 @@ def pruned(split: Path, *done: int) -> list[str]:
     said: list[str] = []
     prune_paused(split, np.array(done), said.append)
     return said
+
+
+def test_save_replaces_no_checkpoint_for_an_earlier_writer(split: Path, kept: dict[int, Paused]) -> None:
+    with only_writer(split, print):
+        now = served(split)
+        serve(split, "an earlier writer")
+        with pytest.raises(LeaseLost):
+            save_paused(split, UNIT, {3: kept[3]}, JOB)
+        same(load_paused(split, range(8), JOB), kept)
+        serve(split, now)
+        save_paused(split, UNIT, {3: kept[3]}, JOB)
+    assert load_paused(split, range(8), JOB).keys() == {3}
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="the system has no such users")

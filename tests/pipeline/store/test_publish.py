@@ -1,12 +1,15 @@
 """Splits written to an object store equal those in a folder, whatever the store, the writers and the workers do."""
 
+import errno
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +21,9 @@ from typing import Any
 import pytest
 
 from levelproof.pipeline.errors import Failure, StoreFailure, UserError
+from levelproof.pipeline.jobs import seal as jobs_seal
 from levelproof.pipeline.jobs.schedule import WorkUnit
+from levelproof.pipeline.jobs.unit import failure
 from levelproof.pipeline.store import leases, machine, remote
 from levelproof.pipeline.store.event_files import KEPT, events_of, new_run, runs_in, write_events
 from levelproof.pipeline.store.layout import FRAGMENT, WRITER_LOCK, data_paths, new_attempt, unit_name
@@ -28,6 +33,7 @@ from levelproof.pipeline.store.locks import is_written
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.objects import get, put, remove, require_conditions
 from levelproof.pipeline.store.publish import ended
+from levelproof.pipeline.store.split import locked
 from levelproof.pipeline.verify import verify
 from tests.pace import patience, wait_until
 from tests.pipeline.command import ROOT, TINY, run
@@ -62,7 +68,7 @@ def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 ALSO_MOTO = pytest.mark.parametrize(
     "server", ["little", pytest.param("moto", marks=pytest.mark.campaign)], indirect=True
-)  # with S3's conditions as others know them
+)  # moto implements S3's preconditions independently of ours
 
 
 @pytest.fixture
@@ -180,7 +186,7 @@ def taken_over(split: Path) -> Lease:
     return lease
 
 
-STEPS = {  # requests of an attempt, by what they have in them, and which of those it is
+STEPS = {  # requests of an attempt: text that a request's line in the log contains, and its number among such lines
     "mark": ("begun", 1),
     "look": (".parquet", 2),  # the first checks for an unreported commit
     "lease": (".writer.lock", 1),
@@ -267,6 +273,23 @@ def assert_sealed(here: Path) -> None:
     assert not [path for path in remote.stored_in(THERE) if path.suffix == ".begun"]
 
 
+def test_full_disk_of_temporary_files_is_named_instead_of_the_store(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A failed write, unlike a failed open, does not name its file."""
+
+    def fail(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    words = f"^Cannot write to {tempfile.gettempdir()}, the disk is full"
+    with pytest.raises(Failure, match=words), locked(THERE, print):
+        fail()
+    monkeypatch.setattr(jobs_seal, "seal", fail)
+    with pytest.raises(Failure, match=words):
+        jobs_seal.Sealer(THERE, [], print)._seal([])
+    assert re.match(words, failure(THERE, WorkUnit((0,)), OSError(errno.ENOSPC, "")).fatal)
+
+
 @ALSO_MOTO
 def test_one_of_two_attempts_at_a_unit_is_committed(server: Server) -> None:
     with ThreadPoolExecutor() as threads:
@@ -321,7 +344,7 @@ def test_lease_refuses_a_second_writer_while_it_is_renewed(
 
 @pytest.fixture
 def interruptible() -> Iterator[None]:
-    """Let Ctrl-C interrupt, also if the tests run as a background job, which ignores it."""
+    """Let Ctrl-C interrupt this process, even if the tests run as a background job, which ignores it."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -384,7 +407,7 @@ def test_lease_survives_lost_responses_to_renewals(server: Server, monkeypatch: 
             server.spoil(0)
             await_renewals(lambda: json.loads(get(THERE / WRITER_LOCK).data)["renewals"], 3)
     except KeyboardInterrupt:
-        pytest.fail("it takes itself for another writer")
+        pytest.fail("it mistook its own renewal for another writer's")
     lease.release()
     assert get(THERE / WRITER_LOCK).data == b"{}"
 
@@ -401,9 +424,9 @@ def test_verify_finds_missing_levels_after_a_kill_in_a_store_whose_clock_is_ahea
         patched.setattr(verify, "prepare_jax", lambda: None)  # JAX keeps the cache folder of these tests
         done = command(["verify", str(THERE), "--json"], tmp_path)
     assert done.returncode == 1, done.stdout
-    told = json.loads(done.stdout)
-    assert told["missing"] == [[2, 3]]
-    assert [of["what"] for of in told["wrong"]] == [
+    facts = json.loads(done.stdout)
+    assert facts["missing"] == [[2, 3]]
+    assert [entry["what"] for entry in facts["wrong"]] == [
         "The last command requested levels 2 to 3, but no fragment has them."
     ], "nothing else is wrong"
 
@@ -416,7 +439,7 @@ def await_renewals(count: Callable[[], int], more: int) -> None:
 
 @contextmanager
 def on_a_day(day: str, folder: Path) -> Iterator[pytest.MonkeyPatch]:
-    """Serve a folder by a clock that says this day, in place of the server before."""
+    """Serve a folder from a store whose clock shows this day, in place of the current server."""
     bucket = bucket_of(folder)
 
     def on_that_day(*request: Any) -> Answer:
@@ -506,11 +529,11 @@ def test_generate_refuses_read_only_urls(out: str) -> None:
 
 
 def test_generate_refuses_a_store_without_preconditions(server: Server, tmp_path: Path) -> None:
-    heeding = bucket_of(tmp_path / "s3")
-    careless = lambda method, path, headers, body: heeding(
+    conditional = bucket_of(tmp_path / "s3")
+    unconditional = lambda method, path, headers, body: conditional(
         method, path, {name: x for name, x in headers.items() if not name.startswith("if-")}, body
     )
-    with serving(careless) as other, pytest.MonkeyPatch.context() as patched:
+    with serving(unconditional) as other, pytest.MonkeyPatch.context() as patched:
         patched.setenv("AWS_ENDPOINT_URL", other.url)
         forget()
         with pytest.raises(UserError, match="does not support the preconditions"):
@@ -544,7 +567,7 @@ def test_fences_are_invisible_to_readers_and_replaced_by_units(server: Server, h
 def test_generate_writes_the_same_to_a_store_and_a_folder(server: Server, tmp_path: Path) -> None:
     generate = ["generate", *TINY, "keep_experts=true"]
     assert command([*generate, "executor=inline"], tmp_path).returncode == 0
-    done = run([*generate, f"out={OUT}", "workers=1"], tmp_path)
+    done = run([*generate, f"out={OUT}", "workers=1", "executor=ray"], tmp_path)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
     assert f"levelproof inspect {OUT}/5k/s" in done.stdout

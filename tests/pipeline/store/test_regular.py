@@ -1,12 +1,7 @@
-"""Files that a command opens in a split of others: whatever has their names, no other file is written."""
+"""Files that a command opens in an untrusted split: whatever is planted under their names, no other file changes."""
 
-import contextlib
 import os
-import signal
-import socket
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -19,53 +14,16 @@ from levelproof.pipeline.store.leases import LeaseLost
 from levelproof.pipeline.store.locks import committing, only_writer
 from levelproof.pipeline.store.pieces import PieceCache
 from levelproof.pipeline.store.remote import INDEX
-from tests.pace import patience
-from tests.pipeline.command import COMMAND_SECONDS, assert_refused, here
+from tests.pipeline.command import assert_refused, here
 from tests.pipeline.made import made_split
+from tests.pipeline.planted import MINE, PLANTED, never_hangs, profile
 
-MINE = b"export PATH"
-
-
-@pytest.fixture(autouse=True)
-def _no_hang() -> Iterator[None]:
-    """Fail instead of waiting for a pipe."""
-
-    def expire(*_: Any) -> None:
-        raise TimeoutError("it hangs")
-
-    before = signal.signal(signal.SIGALRM, expire)
-    signal.alarm(int(patience(COMMAND_SECONDS)))
-    yield
-    signal.alarm(0)
-    signal.signal(signal.SIGALRM, before)
-
-
-@pytest.fixture
-def profile(tmp_path: Path) -> Path:
-    """Write a file of the user outside of the split."""
-    path = tmp_path / "profile"
-    path.write_bytes(MINE)
-    return path
+__all__ = ["never_hangs", "profile"]  # fixtures
 
 
 @pytest.fixture
 def split(tmp_path: Path) -> Path:
     return made_split(tmp_path / "data", [[Label.SOLVED], [Label.UNSOLVED]])
-
-
-def socket_at(path: Path, _: Path) -> None:
-    with contextlib.chdir(path.parent), socket.socket(socket.AF_UNIX) as one:  # a socket's path must be short
-        one.bind(path.name)
-
-
-PLANTED: dict[str, Callable[[Path, Path], object]] = {
-    "link": lambda path, profile: path.symlink_to(profile),
-    "link to nothing": lambda path, profile: path.symlink_to(profile.with_name("new")),
-    "hard link": lambda path, profile: path.hardlink_to(profile),
-    "pipe": lambda path, _: os.mkfifo(path),
-    "socket": socket_at,
-    "folder": lambda path, _: path.mkdir(),
-}
 
 
 @pytest.mark.parametrize("lock", [WRITER_LOCK, COMMIT_LOCK])

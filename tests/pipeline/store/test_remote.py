@@ -347,7 +347,7 @@ def test_processes_share_a_cache_and_survive_kills(bucket: Bucket, split: Path) 
     code = (
         "import sys, hashlib\nfrom pathlib import Path\nfrom levelproof.pipeline.read.rows import read_rows\n"
         "from levelproof.pipeline.store.manifest import read_manifest\nsplit = Path(sys.argv[1])\n"
-        "table = read_manifest(split).table\nprint('at work', flush=True)\n"
+        "table = read_manifest(split).table\nprint('ready', flush=True)\n"
         "found = read_rows(split, table.filter(table['shard'].is_valid()))\n"
         "print(hashlib.sha256(b''.join(found[name].tobytes() for name in sorted(found))).hexdigest())"
     )
@@ -362,7 +362,7 @@ def test_processes_share_a_cache_and_survive_kills(bucket: Bucket, split: Path) 
         processes = [begin("s3://bucket/data/s") for _ in range(3)]
         stdout = processes[0].stdout
         assert stdout
-        assert stdout.readline() == "at work\n"
+        assert stdout.readline() == "ready\n"
         time.sleep(delay)
         processes[0].kill()
         processes[0].communicate()
@@ -435,7 +435,7 @@ def test_commands_that_read_accept_urls_and_others_refuse_them(bucket: Bucket, s
 
 
 def test_forked_processes_are_refused(tmp_path: Path) -> None:
-    """It lacks the threads of its parent: both would wait forever."""
+    """A forked process lacks its parent's threads, so it would wait forever, and its parent for it."""
     code = (
         "import os\nfrom pathlib import Path\nfrom levelproof.pipeline.store import remote\n"
         "remote.place(Path('s3://bucket/data'))\n"

@@ -107,7 +107,7 @@ def left(folder: Path, machine: dict[str, str] | None = None) -> Path:
     return folder
 
 
-def test_sweep_keeps_folders_not_of_a_dead_local_process(
+def test_sweep_keeps_folders_that_no_dead_local_process_left(
     parent: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     elsewhere = tmp_path_factory.mktemp("elsewhere")
@@ -131,7 +131,7 @@ def test_sweep_keeps_folders_not_of_a_dead_local_process(
     assert (target / FILES / "file").exists()
 
 
-@pytest.mark.skipif(os.getuid() != 0, reason="only an administrator gives files away")
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give files away")
 def test_sweep_keeps_folders_of_other_users(parent: Path) -> None:
     folder = left(parent / f"{PREFIX}theirs")
     os.chown(folder, 12345, 12345)
@@ -140,7 +140,7 @@ def test_sweep_keeps_folders_of_other_users(parent: Path) -> None:
     assert (folder / FILES / "file").exists()
 
 
-def test_sweep_goes_by_the_host_name_where_boots_have_no_id(parent: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sweep_compares_host_names_if_there_are_no_boot_ids(parent: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine, "BOOT_ID", parent / "none")
     other = left(parent / f"{PREFIX}other", {"host": "another", "boot": ""})
     left(parent / f"{PREFIX}own")

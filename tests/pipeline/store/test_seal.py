@@ -261,7 +261,7 @@ def test_read_manifest_lists_again_during_a_seal(split: Path, made: Path, monkey
     """A listing is not atomic: it may miss the sealed fragment and the removed sources."""
     seal(split, pieces(split))
     listed, torn = manifest.entries, [True]
-    monkeypatch.setattr(manifest, "entries", lambda *of: {} if torn and torn.pop() else listed(*of))
+    monkeypatch.setattr(manifest, "entries", lambda *where: {} if torn and torn.pop() else listed(*where))
     assert read_manifest(split, []).level_ids.tolist() == list(whole(made))
 
 
@@ -315,19 +315,25 @@ class Stopped(Exception):
     """Raised to stop the seal."""
 
 
-def test_seal_stopped_at_any_file_loses_nothing(split: Path, made: Path) -> None:
-    fragment = fragment_path(split, unit_name(0, 2 * UNITS - 1))
-    for committed in (False, True):
-        asked = [0]
+@pytest.mark.parametrize(("committed", "left"), [(False, 0), (True, UNITS + 1), (True, 1)])
+def test_seal_stopped_at_any_file_loses_nothing(split: Path, made: Path, committed: bool, left: int) -> None:
+    """Before its commit; or after it, before it removes the first of `left` fragments or, with one left, a shard."""
+    fragment, asked = fragment_path(split, unit_name(0, 2 * UNITS - 1)), 0
+    shards = len(list((split / "shards").iterdir()))
 
-        def moved(count: int, committed: bool = committed, asked: list[int] = asked) -> None:
-            asked[0] += not count  # before a file is opened or removed, no chunk has moved
-            if fragment.exists() if committed else asked[0] > UNITS:  # it has read all fragments by then
-                raise Stopped
+    def moved(count: int) -> None:
+        nonlocal asked
+        asked += not count  # before a file is opened or removed, no chunk has moved
+        ready = fragment.exists() and len(fragment_paths(split)) == left
+        if ready if committed else asked > UNITS:  # it has read all fragments by then
+            raise Stopped
 
-        with pytest.raises(Stopped):
-            seal(split, pieces(split), moved)
-        assert whole(split) == whole(made)
-        clean(split, print)
-        assert_tidy(split, 1 if committed else UNITS)
+    with pytest.raises(Stopped):
+        seal(split, pieces(split), moved)
+    if committed:
+        assert len(fragment_paths(split)) == left
+        assert len(list((split / "shards").iterdir())) == shards + 1
+    assert whole(split) == whole(made)
+    clean(split, print)
+    assert_tidy(split, 1 if committed else UNITS)
     assert whole(split) == whole(made)

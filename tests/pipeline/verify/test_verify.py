@@ -84,8 +84,12 @@ def exchange_worlds(split: Path, a: Row, b: Row) -> None:
     forge(split)
 
 
-def set_another_device(row: Row) -> None:
+def set_another_processor(row: Row) -> None:
     row["device"] = "cpu: of another kind"
+
+
+def set_a_gpu(row: Row) -> None:
+    row["device"] = "gpu: of some kind"
 
 
 def assert_reported(split: Path, *sentences: str) -> None:
@@ -147,7 +151,7 @@ def test_examine_reports_a_failing_server_as_such_and_not_as_damage(
 @pytest.mark.parametrize("adapts", [False, True])
 @pytest.mark.parametrize("elsewhere", [False, True])
 def test_examine_finds_exchanged_worlds(split: Path, adapts: bool, elsewhere: bool) -> None:
-    """With or without exchanged rows, and whichever stack the rows claim."""
+    """With or without exchanged rows, and whether or not the rows claim to be of a GPU, whose bits differ."""
     a, b = neighbours(split)
     exchange_worlds(split, a, b)
     if adapts:
@@ -155,7 +159,7 @@ def test_examine_finds_exchanged_worlds(split: Path, adapts: bool, elsewhere: bo
             position = {name: row[name] for name in ("level_id", "row", "shard")}
             forge(split, lambda changed, new=other | position: changed.update(new), [row["level_id"]])
     if elsewhere:
-        forge(split, set_another_device)
+        forge(split, set_a_gpu)
     what = "a content hash or a signature that differs" if adapts else "a world in its shard that differs"
     assert_reported(split, *sorted(f"Level {row['level_id']} has {what}" for row in (a, b)))
 
@@ -168,7 +172,7 @@ def test_examine_finds_a_row_relabelled_unsolvable(split: Path, label: Label, el
     change = {"label": "unsolvable", "label_reason": reason, "shard": None, "row": None, "steps_to_goal": None}
     forge(split, lambda row: row.update(change), [level_id])
     if elsewhere:
-        forge(split, set_another_device)
+        forge(split, set_a_gpu)
     proper = "should be trivial" if label is Label.TRIVIAL else "nothing proves that"
     assert_reported(split, f"Level {level_id} is unsolvable, but {proper}.")
 
@@ -216,7 +220,8 @@ def test_examine_finds_rows_that_name_another_levels_position(split: Path) -> No
     assert_reported(split, "which has level None there")
 
 
-def test_examine_finds_a_record_that_differs_in_one_bit(split: Path) -> None:
+def test_examine_finds_a_record_that_differs_in_one_bit(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On any CPU if one made it, and on the GPU that made it."""
     row = rows_labelled(split, Label.SOLVED)[0]
     shard = Shard(split / row["shard"])
     arrays = shard.read()
@@ -225,8 +230,12 @@ def test_examine_finds_a_record_that_differs_in_one_bit(split: Path) -> None:
     write_shard(shard.path, shard.level_ids, arrays)
     forge(split)
     assert_reported(split, f"Level {row['level_id']} has a witness that does not replay: its reward differs.")
-    forge(split, set_another_device)
+    forge(split, set_another_processor)
+    assert_reported(split, f"Level {row['level_id']} has a witness that does not replay: its reward differs.")
+    forge(split, set_a_gpu)
     assert_reported(split)
+    monkeypatch.setattr(evidence, "device", lambda: "gpu: of some kind")
+    assert_reported(split, f"Level {row['level_id']} has a witness that does not replay: its reward differs.")
 
 
 def test_examine_bounds_the_lost_levels_of_a_damaged_fragment(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:

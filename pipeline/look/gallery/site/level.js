@@ -1,4 +1,5 @@
-// The page of one level: its witness played from stored states, its learning curve, the reason for its label.
+// The page of one level: its witness played from stored states, a policy's attempt beside it, its learning curve, the
+// reason for its label.
 "use strict";
 
 (function () {
@@ -9,7 +10,7 @@
 
   class LevelPage {
     constructor(columns, worlds) {
-      Object.assign(this, { columns, worlds, row: null, film: null, playing: false });
+      Object.assign(this, { columns, worlds, row: null, film: null, policy: null, steps: 0, playing: false });
       this.colours = levelproof.coloursOf();
       at("play").addEventListener("click", () => this.play(!this.playing));
       at("step-back").addEventListener("click", () => this.seek(Math.ceil(this.time) - 1));
@@ -19,29 +20,27 @@
       at("copy").addEventListener("click", () => this.copy("command", "copy"));
       at("copy-hands").addEventListener("click", () => this.copy("hands", "copy-hands"));
       addEventListener("keydown", (event) => this.key(event));
-      new ResizeObserver(() => this.fit()).observe(at("stage"));
+      const observer = new ResizeObserver(() => this.fit());
+      for (const stage of ["stage", "policy-stage"]) observer.observe(at(stage));
     }
 
     // Show the level of a row; null closes the page.
     async open(row) {
       this.play(false);
-      Object.assign(this, { row, film: null, world: null });
+      Object.assign(this, { row, film: null, policy: null, steps: 0, world: null });
       if (row === null) return;
       const id = this.columns.values.level_id[row];
       const [world, data] = await Promise.all([this.worlds.get(row), load(`levels/${Math.floor(row / this.columns.about.folder)}/${id}`)]);
       if (this.row !== row) return; // another level was opened while this one loaded
       this.world = world;
-      if (data.states) {
-        const actions = bytesOf(data.actions);
-        const steps = actions.length / ENTRIES;
-        const action = (step) => actions.subarray(ENTRIES * step, ENTRIES * (step + 1));
-        this.film = { steps, action, states: statesOf(world, data.states, steps + 1) };
-        this.now = new Float32Array(world.start.length);
-      }
+      this.film = filmOf(world, data);
+      this.policy = data.policy ? { ...filmOf(world, data.policy), solved: data.policy.solved } : null;
+      this.steps = Math.max(0, ...[this.film, this.policy].filter(Boolean).map((film) => film.steps)); // of the longer
+      this.now = new Float32Array(world.start.length);
       this.time = 0;
       this.describe(data.row);
       this.fit();
-      if (this.film && !matchMedia("(prefers-reduced-motion: reduce)").matches) this.play(true);
+      if (this.steps && !matchMedia("(prefers-reduced-motion: reduce)").matches) this.play(true);
     }
 
     describe(row) {
@@ -52,8 +51,8 @@
       at("reason").textContent = `${reason[0].toUpperCase()}${reason.slice(1)}.`;
       at("command").textContent = row.command;
       at("hands").textContent = `levelproof play ${this.columns.about.split} ${row.level_id}`;
-      at("controls").hidden = !this.film;
-      at("scrub").max = this.film ? this.film.steps : 0;
+      at("controls").hidden = !this.steps;
+      at("scrub").max = this.steps;
       this.keys = liveEntries(this.world).map((entry) => {
         const element = create("span", { class: "key", style: `--colour: var(--binding-${entry})` });
         return { entry, element, motor: entry < 4 };
@@ -70,6 +69,14 @@
       at("row").replaceChildren(...entries.flatMap(([name, entry]) => [create("dt", {}, readable(name)), create("dd", {}, name === "level_id" ? String(entry) : value(entry))]));
       const known = this.film ? `its witness reaches the goal in ${this.film.steps} steps` : "there is no witness, so this is its initial world";
       at("stage").setAttribute("aria-label", `Level ${row.level_id}, ${row.label}: ${known}. ${worldInWords(this.world)}`);
+      at("stages").classList.toggle("two", Boolean(this.policy));
+      at("policy").hidden = !this.policy;
+      at("stage-words").hidden = !this.policy;
+      if (!this.policy) return;
+      const outcome = `${this.policy.solved ? "solves it" : "fails"} in ${this.policy.steps} steps`;
+      at("stage-words").textContent = this.film ? `Witness: ${this.film.steps} steps` : "No witness";
+      at("policy-words").textContent = `Policy: ${outcome}`;
+      at("policy-stage").setAttribute("aria-label", `The policy's attempt: it ${outcome}.`);
     }
 
     recolour() {
@@ -78,29 +85,30 @@
     }
 
     fit() {
-      if (levelproof.fit(at("stage"))) this.draw();
+      const fitted = ["stage", "policy-stage"].map((stage) => levelproof.fit(at(stage)));
+      if (fitted.some(Boolean)) this.draw();
     }
 
     seek(time) {
-      if (!this.film) return;
+      if (!this.steps) return;
       this.play(false);
-      this.time = Math.min(this.film.steps, Math.max(0, time));
+      this.time = Math.min(this.steps, Math.max(0, time));
       this.draw();
     }
 
     play(playing) {
-      this.playing = playing && Boolean(this.film);
+      this.playing = playing && this.steps > 0;
       at("play").textContent = this.playing ? "Pause" : "Play";
       if (!this.playing) return;
-      if (this.time >= this.film.steps) this.time = 0;
+      if (this.time >= this.steps) this.time = 0;
       let before = performance.now();
-      const film = this.film;
+      const world = this.world;
       const frame = (now) => {
-        if (!this.playing || this.film !== film) return;
+        if (!this.playing || this.world !== world) return;
         const steps = ((now - before) / 1000 / this.columns.about.step_seconds) * Number(at("speed").value);
         before = now;
         this.time += Math.max(0, steps);
-        if (this.time > film.steps + REST / this.columns.about.step_seconds) this.time = 0;
+        if (this.time > this.steps + REST / this.columns.about.step_seconds) this.time = 0;
         this.draw();
         requestAnimationFrame(frame);
       };
@@ -109,27 +117,36 @@
 
     draw() {
       if (!this.world || !at("stage").clientWidth) return;
-      if (!this.film) {
-        drawWorld(at("stage"), this.world, this.colours);
-        return;
+      const acting = this.show(at("stage"), this.film);
+      const tried = this.policy && this.show(at("policy-stage"), this.policy);
+      if (!this.steps) return;
+      const time = Math.min(this.time, this.steps);
+      at("scrub").value = Math.floor(time);
+      const clock = `step ${Math.floor(time)} of ${this.steps} · ${(time * this.columns.about.step_seconds).toFixed(1)} s`;
+      if (at("clock").textContent !== clock) at("clock").textContent = clock;
+      const shown = acting || tried;
+      for (const { entry, element, motor } of this.keys) {
+        const words = `${entryName(entry)} ${["off", motor ? "forward" : "on", "back"][shown[entry]]}`;
+        if (element.textContent !== words) {
+          element.textContent = words;
+          element.classList.toggle("lit", shown[entry] !== 0);
+        }
       }
-      const { steps, states, action } = this.film;
+    }
+
+    // Draw a film at the page's time, or the initial world; return the film's action.
+    show(stage, film) {
+      if (!film) {
+        drawWorld(stage, this.world, this.colours);
+        return null;
+      }
+      const { steps, states, action } = film;
       const time = Math.min(this.time, steps);
       const step = Math.min(Math.floor(time), steps - 1);
       const places = between(states[step], states[step + 1], time - step, this.now);
-      const acting = action(step);
       const trails = at("trails").checked ? { states, until: Math.floor(time) } : null;
-      drawWorld(at("stage"), this.world, this.colours, { places, action: acting, trails });
-      at("scrub").value = Math.floor(time);
-      const clock = `step ${Math.floor(time)} of ${steps} · ${(time * this.columns.about.step_seconds).toFixed(1)} s`;
-      if (at("clock").textContent !== clock) at("clock").textContent = clock;
-      for (const { entry, element, motor } of this.keys) {
-        const words = `${entryName(entry)} ${["off", motor ? "forward" : "on", "back"][acting[entry]]}`;
-        if (element.textContent !== words) {
-          element.textContent = words;
-          element.classList.toggle("lit", acting[entry] !== 0);
-        }
-      }
+      drawWorld(stage, this.world, this.colours, { places, action: action(step), trails });
+      return action(step);
     }
 
     async copy(from, button) {
@@ -152,7 +169,7 @@
         ArrowLeft: () => this.seek(Math.ceil(this.time) - 1),
         ArrowRight: () => this.seek(Math.floor(this.time) + 1),
         Home: () => this.seek(0),
-        End: () => this.film && this.seek(this.film.steps),
+        End: () => this.seek(this.steps),
         Escape: () => at("back").click(),
         n: () => at("next").click(),
         p: () => at("previous").click(),
@@ -161,6 +178,15 @@
       event.preventDefault();
       deeds[event.key]();
     }
+  }
+
+  // Decode an episode, of a witness or a policy; null if there is none.
+  function filmOf(world, data) {
+    if (!data.states) return null;
+    const actions = bytesOf(data.actions);
+    const steps = actions.length / ENTRIES;
+    const action = (step) => actions.subarray(ENTRIES * step, ENTRIES * (step + 1));
+    return { steps, action, states: statesOf(world, data.states, steps + 1) };
   }
 
   // Describe a world in words, for screen readers.

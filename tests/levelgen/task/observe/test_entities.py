@@ -9,6 +9,7 @@ from levelproof.levelgen.task.actions import continuous_controls, discrete_contr
 from levelproof.levelgen.task.observe.entities import entities, padded_shape, symbolic_padded
 from levelproof.levelgen.task.observe.flat import symbolic_flat
 from tests.golden.load_seen import Seen, assert_seen, load_seen
+from tests.quick import jit_once
 
 
 @pytest.fixture(scope="module", params=["s", "m", "l"])
@@ -22,11 +23,11 @@ def test_golden_observations_cover_enough_states(seen: Seen) -> None:
 
 @pytest.mark.parametrize(("name", "look"), [("flat", symbolic_flat), ("padded", symbolic_padded)])
 def test_flat_and_padded_rows_equal_the_references(seen: Seen, name: str, look) -> None:
-    assert_seen(seen.fields, name, np.asarray(jax.jit(look)(seen.level, seen.level.state)))
+    assert_seen(seen.fields, name, np.asarray(jit_once(look)(seen.level, seen.level.state)))
 
 
 def test_entities_equal_the_references(seen: Seen) -> None:
-    ours = jax.jit(entities)(seen.level, seen.level.state)
+    ours = jit_once(entities)(seen.level, seen.level.state)
     assert {f"entity/{name}" for name in vars(ours)} <= set(seen.fields)
     for name, values in vars(ours).items():
         assert_seen(seen.fields, f"entity/{name}", np.asarray(values))
@@ -43,7 +44,7 @@ def test_actions_give_the_references_controls(seen: Seen, name: str, obey) -> No
 def test_observations_of_a_broken_world_are_finite(seen: Seen) -> None:
     broken = jax.tree.map(lambda x: np.full_like(x, np.nan) if x.dtype == np.float32 else x, seen.level.state)
     for look in (symbolic_padded, entities):
-        assert all(np.isfinite(x).all() for x in jax.tree.leaves(jax.jit(look)(seen.level, broken)))
+        assert all(np.isfinite(x).all() for x in jax.tree.leaves(jit_once(look)(seen.level, broken)))
 
 
 def test_shapes_are_the_references() -> None:

@@ -18,10 +18,11 @@ from levelproof.levelgen.task.observe.flat import (
     feature_count,
 )
 from levelproof.physics.types import FIXED_POLYGONS, State
+from tests.quick import jit_once
 
 LANES = 16
 level_features, state_features, symbolic_flat = map(
-    jax.jit, (flat.level_features, flat.state_features, flat.symbolic_flat)
+    jit_once, (flat.level_features, flat.state_features, flat.symbolic_flat)
 )
 
 
@@ -70,16 +71,16 @@ def test_constant_and_dynamic_features_make_the_whole(level: Level) -> None:
 
 
 def test_body_features_follow_the_layout(level: Level) -> None:
-    seen, size, state = np.asarray(symbolic_flat(level, level.state)), level.size, level.state
-    first_movable = seen[POLYGON_ROWS : 2 * POLYGON_ROWS]
+    observed, size, state = np.asarray(symbolic_flat(level, level.state)), level.size, level.state
+    first_movable = observed[POLYGON_ROWS : 2 * POLYGON_ROWS]
     active = np.asarray(level.model.active[FIXED_POLYGONS])
     np.testing.assert_array_equal(first_movable[0, active], state.position[FIXED_POLYGONS, 0][active])
     role = np.asarray(level.role[FIXED_POLYGONS])
     np.testing.assert_array_equal(first_movable[8 + Role.GREEN, active], (role == Role.GREEN)[active])
     start = (size.polygons - 3) * POLYGON_ROWS
-    circle = seen[start : start + CIRCLE_ROWS]
+    circle = observed[start : start + CIRCLE_ROWS]
     np.testing.assert_array_equal(circle[-1], level.model.active[size.polygons])
-    np.testing.assert_allclose(seen[-1], -0.981, rtol=1e-6)
+    np.testing.assert_allclose(observed[-1], -0.981, rtol=1e-6)
 
 
 def test_features_of_inactive_entities_are_zero(level: Level) -> None:
@@ -89,8 +90,8 @@ def test_features_of_inactive_entities_are_zero(level: Level) -> None:
         joint_active=np.zeros_like(level.model.joint_active),
         thruster_active=np.zeros_like(level.model.thruster_active),
     )
-    seen = symbolic_flat(dataclasses.replace(level, model=model), level.state)
-    assert not np.asarray(seen)[:-1].any()
+    observed = symbolic_flat(dataclasses.replace(level, model=model), level.state)
+    assert not np.asarray(observed)[:-1].any()
 
 
 def test_features_are_clipped_and_nan_is_zero(level: Level) -> None:
@@ -99,9 +100,11 @@ def test_features_are_clipped_and_nan_is_zero(level: Level) -> None:
     far_y = nan_x.at[FIXED_POLYGONS, 1].set(-14.0)
     fast = jnp.asarray(level.state.velocity).at[FIXED_POLYGONS, 0].set(jnp.inf)
     state = dataclasses.replace(level.state, position=far_y, velocity=fast)
-    seen = np.asarray(symbolic_flat(dataclasses.replace(level, model=model), state))
-    assert np.isfinite(seen).all()
-    np.testing.assert_array_equal(seen[POLYGON_ROWS : POLYGON_ROWS + 3].T, np.tile([0.0, -LIMIT, LIMIT], (LANES, 1)))
+    observed = np.asarray(symbolic_flat(dataclasses.replace(level, model=model), state))
+    assert np.isfinite(observed).all()
+    np.testing.assert_array_equal(
+        observed[POLYGON_ROWS : POLYGON_ROWS + 3].T, np.tile([0.0, -LIMIT, LIMIT], (LANES, 1))
+    )
 
 
 def test_flat_observation_broadcasts_one_level(level: Level) -> None:
@@ -114,5 +117,5 @@ def test_triangle_has_a_marked_fourth_vertex(level: Level) -> None:
     model = dataclasses.replace(
         level.model, n_vertices=np.full_like(level.model.n_vertices, 3), active=np.ones_like(level.model.active)
     )
-    seen = np.asarray(symbolic_flat(dataclasses.replace(level, model=model), level.state))
-    np.testing.assert_array_equal(seen[POLYGON_ROWS - 3 : POLYGON_ROWS].T, np.tile([-1.0, -1.0, 1.0], (LANES, 1)))
+    observed = np.asarray(symbolic_flat(dataclasses.replace(level, model=model), level.state))
+    np.testing.assert_array_equal(observed[POLYGON_ROWS - 3 : POLYGON_ROWS].T, np.tile([-1.0, -1.0, 1.0], (LANES, 1)))

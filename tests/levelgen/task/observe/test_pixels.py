@@ -10,11 +10,12 @@ import pytest
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.observe.pixels import SIDE, pixels
 from tests.golden.load_seen import load_seen
+from tests.quick import jit_once
 
 
 def draw(level: Level) -> np.ndarray:
-    """(lane, x, y, 3), from 0 to 255."""
-    image = jax.jit(jax.vmap(lambda level: pixels(level, level.state).image, in_axes=-1))(level)
+    """Draw each lane: (lane, x, y, 3), from 0 to 255."""
+    image = jit_once(jax.vmap(lambda level: pixels(level, level.state).image, in_axes=-1))(level)
     return 255 * np.asarray(image)
 
 

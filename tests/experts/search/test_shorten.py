@@ -1,4 +1,4 @@
-"""Polishing finds the shortest success if it is known, and depends on the level alone."""
+"""Polishing finds the shortest success of a level in which it is known, and depends on the level alone."""
 
 from functools import cache
 
@@ -10,8 +10,7 @@ from levelproof.experts.labels import Source
 from levelproof.experts.pool.rework import IN_CACHE, rework
 from levelproof.experts.procedure import Procedure
 from levelproof.experts.search.config import SearchConfig
-from levelproof.experts.search.polish import LANES, polish
-from levelproof.experts.search.shorten import Shortened
+from levelproof.experts.search.shorten import LANES, Shortened, polish
 from levelproof.experts.verdict.judge import repeating
 from levelproof.experts.witness.success import Success
 from levelproof.experts.witness.witness import replay, steps_to_goal
@@ -29,7 +28,7 @@ IDLE, WASTED = 40, 20  # env steps of the success that is given
 
 @cache
 def levels() -> Level:
-    """A ball on a line without friction, which one thruster pushes to the goal and another one away from it."""
+    """Return a ball on a line without friction, which one thruster pushes to the goal and another away from it."""
     level = world(bars=[((2.5, 0.2), (2.5, 0.1), 0.0)] * 2, bar_role=Role.PLAIN, ball=(1.0, 2.5), goal=(4.0, 2.5),
                   angles=(0.0, np.pi), thrust=0.4)  # fmt: skip
     level.model.gravity[:] = 0
@@ -54,7 +53,7 @@ def shortest() -> tuple[np.ndarray, int]:
 
 @cache
 def given() -> Success:
-    """Actions that wait, then push."""
+    """Return actions that wait, then push."""
     action, steps = shortest()
     late = np.concatenate([np.zeros((IDLE, ACTIONS), np.int8), action[:-IDLE]])
     late[IDLE + steps :] = 0
@@ -98,11 +97,11 @@ def test_run_polishes_witnesses() -> None:
     procedure = Procedure(search=asked, expert=ExpertConfig(replays=0))
     rough = [witness for pair in zip(*given(), strict=True) for witness in repeating(Success(*pair), Source.SAMPLED)]
     rough[0] = rough[0]._replace(source=Source.NOTHING)
-    found, env_steps = rework(levels(), IDS, [*rough[:-1], None], procedure, DEFAULT_RULES)
-    assert found[0] is rough[0]
-    assert found[-1] is None
+    witnesses, env_steps = rework(levels(), IDS, [*rough[:-1], None], procedure, DEFAULT_RULES)
+    assert witnesses[0] is rough[0]
+    assert witnesses[-1] is None
     assert env_steps.tolist() == [0, *polished().env_steps[1:-1], 0]
-    for i, witness in enumerate(found[1:-1], 1):
+    for i, witness in enumerate(witnesses[1:-1], 1):
         assert witness is not None
         assert (witness.steps, witness.source) == (shortest()[1], Source.SEARCH)
         np.testing.assert_array_equal(witness.action[: witness.steps], polished().success.action[i, : witness.steps])

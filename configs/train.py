@@ -1,0 +1,35 @@
+"""The settings of `levelproof train`."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from levelproof.experts.generalist.config import CurriculumConfig, PPOConfig
+from levelproof.experts.networks.over_levels import NetworkConfig
+from levelproof.physics.bounds import require
+
+CURRICULA = ("uniform", "learnability")  # of random levels
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """What to train on, and how."""
+
+    levels: str = "uniform"  # uniform or learnability: random levels; else a split, or level files
+    size: str = "s"  # of random levels
+    distribution: str = "kinetix"  # preset of random levels
+    where: str = "label NOT IN ('trivial', 'unsolvable')"  # SQL condition that selects levels of a split
+    start: str = ""  # folder of a policy to start from, whose network is taken; empty: from scratch
+    cores: int = 0  # CPU cores; 0: as many as share the lanes out evenly; a run keeps the number that it began with
+    interval: int = 25  # updates between lines of metrics, each with a checkpoint
+    seed: int = 0  # of the initial weights and of what is drawn
+    log: Literal["none", "tensorboard", "wandb"] = "none"  # logger of scalars, besides metrics.jsonl
+    network: NetworkConfig = field(default_factory=NetworkConfig)  # network of a policy from scratch
+    ppo: PPOConfig = field(default_factory=PPOConfig)  # training of the policy
+    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)  # with levels=learnability
+
+    def __post_init__(self) -> None:
+        require(self, ("interval",), 1)
+        require(self, ("cores",), 0, 1024)
+        require(self, ("seed",), 0, 2**31 - 1)
+        if not self.levels:
+            raise ValueError(f"levels is empty: choose one of {', '.join(CURRICULA)}, a split or level files")

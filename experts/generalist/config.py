@@ -1,0 +1,90 @@
+"""Settings of training one policy over many levels."""
+
+from contextlib import suppress
+from dataclasses import dataclass
+
+from levelproof.physics.bounds import require
+
+CHUNK = 256  # lanes that go through the network together: their activations fit a core's cache
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """Hyperparameters of training (hashable: pass as a static argument)."""
+
+    env_steps: int = 20_000_000  # env steps of all lanes; training ends with the update that reaches them
+    environments: int = 512  # lanes, shared out over the cores
+    horizon: int = 64  # env steps in each lane between updates
+    dense_reward_scale: float = 0.2  # 1/m, of the shaping reward
+    epochs: int = 2  # passes over the samples of an update
+    minibatches: int = 32  # updates of the weights in an epoch
+    learning_rate: float = 3e-4  # Adam's step size
+    adam_epsilon: float = 1e-5  # Adam's epsilon
+    max_gradient_norm: float = 1.0  # maximum global norm of the gradient
+    discount: float = 0.995  # discount factor of rewards, per env step
+    gae_lambda: float = 0.9  # lambda of advantage estimates (Schulman et al. 2016, arXiv:1506.02438)
+    clip: float = 0.2  # maximum change of the probability ratio, and of the value, in either direction
+    value_weight: float = 0.5  # weight of the value function's loss
+    entropy_weight: float = 0.01  # weight of the policy's entropy, a bonus in the loss
+    average: float = 0.95  # weight of the past, an update, in the running average of the weights, which is the policy
+    # with start=POLICY
+    critic_updates: int = 10  # first updates, which fit the value function and leave the policy as it is
+    kl_weight: float = 0.2  # weight of the divergence from the start, a penalty in the loss; falls linearly to 0
+    kl_updates: int = 200  # updates after the critic's over which the penalty falls to 0
+
+    def __post_init__(self) -> None:
+        require(self, ("env_steps", "environments", "horizon", "epochs", "minibatches"), 1)
+        require(self, ("learning_rate", "adam_epsilon", "max_gradient_norm"), 0, above=True)
+        require(self, ("discount", "gae_lambda", "clip", "average"), 0, 1)
+        require(self, ("dense_reward_scale", "value_weight", "entropy_weight", "kl_weight"), 0)
+        require(self, ("critic_updates", "kl_updates"), 0)
+
+    @property
+    def steps_per_update(self) -> int:
+        """Env steps of all lanes per update."""
+        return self.environments * self.horizon
+
+    @property
+    def updates(self) -> int:
+        """Updates in `env_steps`."""
+        return -(-self.env_steps // self.steps_per_update)
+
+    def shares_out(self, cores: int) -> bool:
+        """Whether lanes and minibatches share out evenly over so many cores."""
+        with suppress(ValueError):
+            return bool(self.chunk(cores))
+        return False
+
+    def chunk(self, cores: int) -> int:
+        """Return how many of a core's lanes go through the network together.
+
+        Raises:
+            ValueError: lanes do not share out evenly, or chunks over the minibatches.
+        """
+        lanes, over = divmod(self.environments, cores)
+        width = min(lanes, CHUNK)
+        if over or lanes % width:
+            raise ValueError(
+                f"environments is {self.environments}: with {cores} cores it must be a multiple of "
+                f"{cores if self.environments < cores * CHUNK else cores * CHUNK}"
+            )
+        if (chunks := lanes // width * self.horizon) % self.minibatches:
+            raise ValueError(f"minibatches is {self.minibatches}: it must divide {chunks}, the chunks of a core")
+        return width
+
+
+@dataclass(frozen=True)
+class CurriculumConfig:
+    """Settings of the curriculum by learnability (hashable: pass as a static argument)."""
+
+    share: float = 0.5  # share of episodes in levels that the measurement kept; the others play fresh levels
+    every: int = 100  # updates between measurements
+    candidates: int = 1024  # fresh levels that are measured
+    measured_steps: int = 1024  # env steps of a measurement in each level; episodes have up to 256
+    keep: int = 256  # levels with the highest learnability, p(1 - p) of the solve rate p, that are kept
+
+    def __post_init__(self) -> None:
+        require(self, ("share",), 0, 1)
+        require(self, ("every", "candidates", "measured_steps", "keep"), 1)
+        if self.keep > self.candidates:
+            raise ValueError(f"keep is {self.keep}: it must not exceed candidates = {self.candidates}")

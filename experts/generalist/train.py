@@ -1,0 +1,294 @@
+"""Proximal policy optimisation of one policy over many levels, on one or more cores; reads no files.
+
+Lanes are shared out over the cores of a mesh. Each core acts and computes gradients in its own lanes; averaged, they
+change one set of weights, of which every core has a copy.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax.typing import VariableDict
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from levelproof.experts.generalist.actor_critic import ActorCriticParams, initial_actor_critic, logits_and_value
+from levelproof.experts.generalist.config import CHUNK, PPOConfig
+from levelproof.experts.generalist.curricula import Curriculum
+from levelproof.experts.generalist.rollout import Experience, Playing, begin, rollout
+from levelproof.experts.networks.layers import LOGITS
+from levelproof.experts.networks.over_levels import NetworkConfig, logits_and_summary
+from levelproof.experts.objective import advantages, normalised, terms
+from levelproof.experts.policy import divergence
+from levelproof.levelgen.identity.keys import key_of_seed
+from levelproof.levelgen.task.lanes import Table
+from levelproof.levelgen.task.rules import TaskParams
+from levelproof.physics.types import Size
+
+CORES = "core"  # axis of the mesh
+BEGINNING, PLAYING, MEASURING = range(1, 4)  # folded into the seed's key; clones take its own
+TERMS = 4  # means over samples in UpdateFacts
+
+
+class Learner(NamedTuple):
+    """Training under way, with all that decides how it continues."""
+
+    params: ActorCriticParams
+    optimiser: optax.OptState
+    average: Any  # running average of the policy's parameters
+    playing: Playing  # lanes of all cores
+    curriculum: Any
+    updates: Int[Array, ""]
+
+
+class UpdateFacts(NamedTuple):
+    """What happened in an update."""
+
+    episodes: Int[Array, ""]  # that ended
+    solved: Int[Array, ""]  # of them
+    env_steps: Int[Array, ""]  # of them
+    reward: Float[Array, ""]  # sum over them, shaping included
+    entropy: Float[Array, ""]  # of the policy's live entries, nats; this and what follows are means over samples
+    value_error: Float[Array, ""]
+    kl_to_before: Float[Array, ""]  # estimate of KL(policy before || after), nats
+    kl_to_start: Float[Array, ""]  # KL(policy || policy that training started from), nats; 0: none
+
+
+class TrainingRecipe(NamedTuple):
+    """What decides the programs of a training."""
+
+    network: NetworkConfig
+    size: Size
+    ppo: PPOConfig
+    curriculum: Curriculum
+    rules: TaskParams  # with the reward that is learned from
+    seed: int
+
+
+class Programs(NamedTuple):
+    """Compiled functions of a training; they donate the learner."""
+
+    begin: Callable[[Table, VariableDict | None], Learner]
+    advance: Callable[[Learner, Table, VariableDict | None], tuple[Learner, UpdateFacts]]
+    measure: Callable[[Learner, Table], Learner]
+
+
+class Chunk(NamedTuple):
+    """Samples that go through the network together; in arrays of many, the chunk axis is first."""
+
+    seen: Any
+    live: Bool[Array, "6 sample"]
+    action: Int[Array, "6 sample"]
+    log_probability: Float[Array, " sample"]
+    value: Float[Array, " sample"]
+    advantage: Float[Array, " sample"]
+    logits_of_start: Float[Array, "logit sample"]
+
+
+def programs_of(recipe: TrainingRecipe, table: Table, start: VariableDict | None, cores: int) -> Programs:
+    """Return the programs of a training on the first `cores` devices.
+
+    Args:
+        recipe: what is trained, and how.
+        table: the levels; gives shapes only.
+        start: parameters of the policy that training starts from; None: from scratch. Gives shapes only.
+        cores: devices to share the lanes out over.
+    """
+    mesh = Mesh(np.array(jax.devices()[:cores]), (CORES,))
+    whole = PartitionSpec()
+    shape = jax.eval_shape(partial(_begin, recipe), table, start)
+    by_lane = lambda x: PartitionSpec(*[None] * (x.ndim - 1), CORES)
+    kept = Learner(whole, whole, whole, jax.tree.map(by_lane, shape.playing), whole, whole)  # pyright: ignore
+
+    def on_cores(function: Callable, outputs: Any, donated: bool, *inputs: Any) -> Callable:
+        mapped = jax.shard_map(
+            partial(function, recipe), mesh=mesh, in_specs=inputs, out_specs=outputs, check_vma=False
+        )
+        return jax.jit(mapped, donate_argnums=(0,) if donated else ())
+
+    to_mesh = jax.tree.map(lambda spec: NamedSharding(mesh, spec), kept, is_leaf=lambda x: x is whole)
+    return Programs(
+        jax.jit(partial(_begin, recipe), out_shardings=to_mesh),
+        on_cores(_advance, (kept, whole), True, kept, whole, whole),
+        on_cores(_measure, kept, True, kept, whole),
+    )
+
+
+def optimiser_of(config: PPOConfig) -> optax.GradientTransformation:
+    clip = optax.clip_by_global_norm(config.max_gradient_norm)
+    return optax.chain(clip, optax.adam(config.learning_rate, eps=config.adam_epsilon))
+
+
+def _begin(recipe: TrainingRecipe, table: Table, start: VariableDict | None) -> Learner:
+    """Initialise the policy, its critic and all lanes."""
+    of_weights, of_levels = jax.random.split(jax.random.fold_in(key_of_seed(recipe.seed), BEGINNING))
+    params = initial_actor_critic(of_weights, recipe.network, recipe.size, start)
+    state = recipe.curriculum.begin()
+    levels = recipe.curriculum.draw(table, state, of_levels, recipe.ppo.environments)
+    playing = begin(table, levels, recipe.rules)
+    # A copy, because the learner is donated, and no buffer can be donated twice
+    average = jax.tree.map(jnp.copy, params.policy)
+    return Learner(params, optimiser_of(recipe.ppo).init(params), average, playing, state, jnp.int32(0))
+
+
+def _advance(
+    recipe: TrainingRecipe, learner: Learner, table: Table, start: VariableDict | None
+) -> tuple[Learner, UpdateFacts]:
+    """Act in a core's lanes, and take one update together with the other cores."""
+    ppo, update = recipe.ppo, learner.updates
+    key = jax.random.fold_in(_key(recipe, update), jax.lax.axis_index(CORES))
+    of_rollout, of_epochs = jax.random.split(key)
+    draw = partial(recipe.curriculum.draw, table, learner.curriculum)
+    playing, experience, ended = rollout(
+        learner.params, recipe.network, table, learner.playing, draw, of_rollout, ppo.horizon,
+        recipe.rules,
+    )  # fmt: skip
+    chunks = _chunks(recipe, experience, start, update)
+    params, optimiser, means = _epochs(recipe, learner, chunks, of_epochs, start is not None)
+    after = Learner(
+        params,
+        optimiser,
+        _averaged(learner.average, params.policy, update, ppo),
+        playing,
+        learner.curriculum,
+        update + 1,
+    )
+    count = lambda x: jnp.where(ended.done, x, 0).sum()
+    sums = jax.lax.psum((ended.done.sum(), count(ended.goal), count(ended.steps), count(ended.gained)), CORES)
+    return after, UpdateFacts(*sums, *means)
+
+
+def _advantages(experience: Experience, config: PPOConfig) -> Float[Array, "time lane"]:
+    """Estimate advantages; where the task did not end an episode, later rewards are the value of the last state seen.
+
+    That is the state before the time limit's last step, or the rollout's, whose action then counts for nothing. So no
+    state has to go through the network a second time.
+    """
+    open_ended = (experience.done & ~experience.terminated).at[-1].set(~experience.terminated[-1])
+    reward = jnp.where(open_ended, experience.value, experience.reward)
+    over = experience.done | open_ended
+    return advantages(experience.value, reward, over, jnp.zeros_like(reward[0]), config)
+
+
+def _chunks(recipe: TrainingRecipe, experience: Experience, start: VariableDict | None, update: Array) -> Chunk:
+    """Return a core's samples as chunks, chunk axis first."""
+    lanes = experience.value.shape[-1]
+    width = min(lanes, CHUNK)
+
+    def cut(x: Array) -> Array:  # [time, ..., lane] to [chunk, ..., sample]
+        parted = jnp.moveaxis(x.reshape(*x.shape[:-1], lanes // width, width), -2, 1)
+        return parted.reshape(parted.shape[0] * parted.shape[1], *parted.shape[2:])
+
+    advantage = _advantages(experience, recipe.ppo)
+    of_start = jnp.zeros((len(experience.value), 0, lanes))
+    chunks = Chunk(
+        experience.seen, experience.live, experience.action, experience.log_probability, experience.value, advantage,
+        of_start,
+    )  # fmt: skip
+    chunks = jax.tree.map(cut, chunks)
+    if start is None:
+        return chunks
+    logits = lambda observation: logits_and_summary(start, recipe.network, recipe.size, observation)[0]
+    nothing = lambda seen: jnp.zeros((len(chunks.value), LOGITS, width))
+    weighs = _kl_weight(recipe.ppo, update) > 0
+    return chunks._replace(logits_of_start=jax.lax.cond(weighs, partial(jax.lax.map, logits), nothing, chunks.seen))
+
+
+def _epochs(
+    recipe: TrainingRecipe, learner: Learner, chunks: Chunk, key: Key[Array, ""], starts: bool
+) -> tuple[ActorCriticParams, optax.OptState, Any]:
+    """Pass over a core's chunks several times in minibatches; return weights, optimiser and means of the terms."""
+    ppo, update, count = recipe.ppo, learner.updates, len(chunks.value)
+    fitting = (update < ppo.critic_updates) if starts else jnp.array(False)
+    loss = jax.value_and_grad(partial(_loss, recipe=recipe, kl_weight=_kl_weight(ppo, update)), has_aux=True)
+
+    def learn(now: tuple[Any, Any], index: Int[Array, " chunk"]) -> tuple[tuple[Any, Any], Any]:
+        params, state = now
+        batch = jax.tree.map(lambda x: x[index], chunks)
+
+        def add(total: Any, each: tuple[Chunk, Array]) -> tuple[Any, None]:
+            (_, means), gradient = loss(params, *each)
+            return jax.tree.map(jnp.add, total, (gradient, means)), None
+
+        zeros = jax.tree.map(jnp.zeros_like, (params, (0.0,) * TERMS))
+        total, _ = jax.lax.scan(add, zeros, (batch, normalised(batch.advantage)))
+        gradient, means = jax.lax.pmean(jax.tree.map(lambda x: x / len(index), total), CORES)
+        if starts:
+            gradient = gradient._replace(policy=jax.tree.map(lambda x: jnp.where(fitting, 0, x), gradient.policy))
+        change, state = optimiser_of(ppo).update(gradient, state, params)
+        changed: Any = optax.apply_updates(params, change)
+        return (changed, state), means
+
+    def epoch(now: tuple[Any, Any], key: Array) -> tuple[tuple[Any, Any], Any]:
+        return jax.lax.scan(learn, now, jax.random.permutation(key, count).reshape(ppo.minibatches, -1))
+
+    state = learner.optimiser
+    if starts:  # the policy's moments were those of no gradient, which would make its first steps too long
+        fresh = optimiser_of(ppo).init(learner.params)
+        state = jax.tree.map(lambda new, old: jnp.where(update == ppo.critic_updates, new, old), fresh, state)
+    (params, state), means = jax.lax.scan(epoch, (learner.params, state), jax.random.split(key, ppo.epochs))
+    return params, state, jax.tree.map(jnp.mean, means)
+
+
+def _loss(
+    params: ActorCriticParams, chunk: Chunk, gain: Array, recipe: TrainingRecipe, kl_weight: Array
+) -> tuple[Float[Array, ""], tuple[Array, ...]]:
+    ppo = recipe.ppo
+    logits, value = logits_and_value(params, recipe.network, recipe.size, chunk.seen)
+    now = terms(
+        logits, value, chunk.action, chunk.live, chunk.log_probability, chunk.value, chunk.advantage, gain, ppo.clip
+    )
+    change = now.log_probability - chunk.log_probability
+    moved = (jnp.exp(change) - 1 - change).mean()  # Schulman's estimate, which is never negative
+    total = ppo.value_weight * now.value_error - now.surrogate - ppo.entropy_weight * now.entropy
+    from_start = jnp.zeros(())
+    if len(chunk.logits_of_start):
+        from_start = divergence(logits, chunk.logits_of_start, chunk.live).mean()
+        total += jnp.where(kl_weight > 0, kl_weight * from_start, 0.0)
+    return total, (now.entropy, now.value_error, moved, jnp.where(kl_weight > 0, from_start, 0.0))
+
+
+def _kl_weight(config: PPOConfig, update: Array) -> Float[Array, ""]:
+    """Return the weight of the divergence from the start, at an update."""
+    since = jnp.maximum(update - config.critic_updates, 0)
+    return config.kl_weight * jnp.maximum(1 - since / max(config.kl_updates, 1), 0.0)
+
+
+def _averaged(average: Any, policy: Any, update: Array, config: PPOConfig) -> Any:
+    # The first updates count for more, so that the average soon forgets the initial weights
+    kept = jnp.minimum(config.average, (1.0 + update) / (10.0 + update))
+    return jax.tree.map(lambda old, new: old + (1 - kept) * (new - old), average, policy)
+
+
+def _key(recipe: TrainingRecipe, update: Array) -> Key[Array, ""]:
+    """Derive the key of an update."""
+    return jax.random.fold_in(jax.random.fold_in(key_of_seed(recipe.seed), PLAYING), update)
+
+
+def _measure(recipe: TrainingRecipe, learner: Learner, table: Table) -> Learner:
+    """Have the curriculum measure levels, shared out over the cores, by the policy as it acts now."""
+    curriculum = recipe.curriculum
+    assert curriculum.measure
+
+    def attempt(level_index: Int[Array, " level"], steps: int, key: Key[Array, ""]) -> tuple[Array, Array]:
+        cores, core = jax.lax.axis_size(CORES), jax.lax.axis_index(CORES)
+        own = jnp.resize(level_index, (-(-len(level_index) // cores) * cores,)).reshape(cores, -1)[core]
+        parts = jnp.resize(own, (-(-len(own) // CHUNK), min(CHUNK, len(own))))
+
+        def play(part: Array) -> tuple[Array, Array]:
+            again = lambda key, lanes: part
+            now = begin(table, part, recipe.rules)
+            each = jax.random.fold_in(key, part[0])
+            _, _, ended = rollout(learner.params, recipe.network, table, now, again, each, steps, recipe.rules)
+            return ended.done.sum(0), (ended.done & ended.goal).sum(0)
+
+        counts = jax.tree.map(lambda x: x.reshape(-1)[: len(own)], jax.lax.map(play, parts))
+        gather = lambda x: jax.lax.all_gather(x, CORES, axis=0, tiled=True)[: len(level_index)]
+        return jax.tree.map(gather, counts)
+
+    key = jax.random.fold_in(jax.random.fold_in(key_of_seed(recipe.seed), MEASURING), learner.updates)
+    return learner._replace(curriculum=curriculum.measure(table, attempt, key))

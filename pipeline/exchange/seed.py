@@ -1,0 +1,136 @@
+"""Export to a seed file: levels as ids, witnesses as the actions of one episode. docs/seeds.md describes it."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pyarrow as pa
+
+from levelproof.configs.schema import REPEATED, from_files
+from levelproof.experts.labels import Label
+from levelproof.experts.witness.episode import checksum_of
+from levelproof.experts.witness.resume import timesteps
+from levelproof.levelgen.level import Level, size_of
+from levelproof.levelgen.sampling.sampler import CHUNK
+from levelproof.levelgen.task.actions import action_mask
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.read.levels import levels_of, writing_to
+from levelproof.pipeline.read.rows import read_rows
+from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store import files
+from levelproof.pipeline.store.bar import with_bar
+from levelproof.pipeline.store.contents import table_for
+from levelproof.pipeline.store.density import LAST_DISTANCE, MOVES, STATE, task_states
+from levelproof.pipeline.store.fields import tree_of
+from levelproof.pipeline.store.manifest import Manifest, require_manifest
+from levelproof.pipeline.store.remote import as_typed
+from levelproof.pipeline.store.seed.columns import KEPT, ROW_GROUP, SCHEMA
+from levelproof.pipeline.store.seed.file import SUFFIX
+from levelproof.pipeline.store.seed.packed import pack_witness
+from levelproof.pipeline.store.seed.rows import reason_of
+from levelproof.pipeline.store.seed.worlds import pack_worlds
+from levelproof.pipeline.store.seed.write import seed_bytes
+from levelproof.pipeline.words import many
+
+READ = (
+    "content_hash", "label_reason", "witness", "size", "budget", "shard", "row", "versions", "engine", "device", *KEPT,
+)  # fmt: skip
+
+
+def export_seed(split: Path, where: str | None, out: Path) -> None:
+    """Write the levels of `split` that meet the condition (None: all) to a new seed file; print a summary.
+
+    Raises:
+        UserError: the split does not exist, the condition is invalid, no level meets it, or `out` exists or is not
+            named as seed files are.
+        Failure: the split is damaged, or a write fails.
+    """
+    if out.suffix != SUFFIX:
+        raise UserError(f"Cannot write {out}: the name of a seed file must end in {SUFFIX}, as in -o levels{SUFFIX}.")
+    if out.exists():
+        raise UserError(f"{out} already exists: name a new file with -o, or remove that one.")
+    manifest = require_manifest(split, [*READ, *columns_in(where)], compact=True)
+    rows = select(manifest.table, where)
+    if not rows.num_rows:
+        raise UserError(f"No level of {split} meets the condition {where}: choose another one with --where.")
+    prepare_jax()
+    config = {**(manifest.config or {}), **REPEATED}
+    with writing_to(out):
+        firsts = with_bar(range(0, rows.num_rows, ROW_GROUP), "row groups")
+        groups = (_group(manifest, rows.slice(first, ROW_GROUP)) for first in firsts)
+        data = seed_bytes(groups, config, rows["budget"][0].as_py())
+        files.write(out, data)
+    solved = manifest.counts(np.isin(manifest.level_ids, rows["level_id"].to_numpy())).get(Label.SOLVED, 0)
+    each = f", {len(data) / solved:.1f} bytes per solved one" if solved else ""
+    print(f"{out}: {many(rows.num_rows, 'level')} of {as_typed(split)}, {solved:,} solved; {len(data):,} bytes{each}.")
+    print(f'Next:  levelproof.open("{out}")')
+
+
+def _group(manifest: Manifest, rows: pa.Table) -> tuple[pa.Table, list[str]]:
+    """Return a row group, and the content hashes of its levels."""
+    columns: dict[str, Any] = {name: rows.column(name) for name in ("level_id", *KEPT)}
+    columns |= {"source": rows.column("witness"), "label_reason": _reasons(rows), "made_with": _made_with(rows)}
+    witnessed = np.flatnonzero(rows.column("shard").is_valid())
+    witness, checksum = np.full(rows.num_rows, None, object), np.zeros(rows.num_rows, np.uint32)
+    for first in range(0, len(witnessed), CHUNK):
+        some = witnessed[first : first + CHUNK]
+        witness[some], checksum[some] = _witnesses(manifest, rows.take(some))
+    columns["witness"] = pa.array(witness.tolist(), pa.binary())
+    columns["checksum"] = pa.array(checksum, mask=~rows.column("shard").is_valid().to_numpy())
+    columns["content"] = pa.array(list(_content(manifest, rows)), pa.binary())
+    table = pa.table({name: _plain(columns[name]) for name in SCHEMA.names}, schema=SCHEMA)
+    return table, rows.column("content_hash").to_pylist()
+
+
+def _plain(column: Any) -> Any:
+    """Return strings without dictionaries; other columns unchanged."""
+    return column.cast(pa.string()) if pa.types.is_dictionary(column.type) else column
+
+
+def _witnesses(manifest: Manifest, rows: pa.Table) -> tuple[list[bytes], np.ndarray]:
+    """Pack the first episodes of rows; return them and their checksums.
+
+    Raises:
+        Failure: an episode is not as the manifest says.
+    """
+    known = [field.name for field in table_for(size_of(rows["size"][0].as_py()))]
+    wanted = [name for name in known if name.startswith(("level/", STATE)) or name in (LAST_DISTANCE, *MOVES)]
+    arrays = read_rows(manifest.split, rows, wanted)
+    steps, lanes = rows.column("steps_to_goal").fill_null(0).to_numpy(), np.arange(rows.num_rows)
+    done, goal, action = (arrays[name] for name in ("record/done", "record/goal", "record/action"))
+    wrong = (steps < 1) | (done.argmax(0) != steps - 1) | ~goal[steps - 1, lanes]
+    if wrong.any():
+        raise Failure(
+            f"The first episode of level {rows['level_id'][int(wrong.argmax())]} does not end at the goal as its row "
+            f"says: run `levelproof verify {manifest.split}`."
+        )
+    live = np.asarray(action_mask(tree_of(Level, arrays, "level/")))
+    packed = [pack_witness(action[: steps[i], :, i], live[:, i]) for i in lanes]
+    return packed, checksum_of(task_states(arrays, STATE, timesteps(done)), steps)
+
+
+def _content(manifest: Manifest, rows: pa.Table) -> Iterator[bytes | None]:
+    """Yield each level's content; None for levels that come from ids."""
+    if not from_files(manifest.config or {}):
+        yield from [None] * rows.num_rows
+        return
+    for first in range(0, rows.num_rows, CHUNK):
+        yield from pack_worlds(jax.tree.map(np.asarray, levels_of(manifest, rows.slice(first, CHUNK))))
+
+
+def _reasons(rows: pa.Table) -> pa.Array:
+    columns = [rows.column(name).to_pylist() for name in ("label", "witness", "steps_to_goal", "label_reason")]
+    return pa.array(
+        [None if reason_of(*known) else reason for *known, reason in zip(*columns, strict=True)], pa.string()
+    )
+
+
+def _made_with(rows: pa.Table) -> pa.Array:
+    """Return the versions, engine and device of each row as JSON."""
+    names = ("versions", "engine", "device")
+    made = zip(*(rows.column(name).to_pylist() for name in names), strict=True)
+    return pa.array([json.dumps(dict(zip(names, one, strict=True)), sort_keys=True) for one in made])

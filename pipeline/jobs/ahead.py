@@ -1,0 +1,82 @@
+"""A job's programs, compiled before its levels come: each by one worker of a machine, those that take longest first."""
+
+import hashlib
+import time
+from contextlib import suppress
+from pathlib import Path
+from threading import Lock
+
+from levelproof.configs.schema import JobConfig
+from levelproof.experts.pool.pool import Pool
+from levelproof.experts.pool.programs import Program, programs_of
+from levelproof.levelgen.level import size_of
+from levelproof.pipeline.claims import try_claim
+from levelproof.pipeline.jobs.likeness import program_of
+from levelproof.pipeline.runtime import cache_folder
+from levelproof.pipeline.store.provenance import device
+
+DONE = b"compiled"  # content of the claim of a compiled program
+
+
+class Ahead:
+    """The programs of a job, of which this process compiles those that no other process of this machine does.
+
+    Threads may share it: XLA compiles their programs side by side. Whatever needs a program that another process
+    compiles at this moment waits for it (`claims.share_compiling`).
+    """
+
+    def __init__(self, job: JobConfig, pool: Pool) -> None:
+        folder, programs = cache_folder() / "jax", programs_of(pool, size_of(job.size))
+        search = job.search.scaled(size_of(job.size).bodies)
+        of_code = [entry for entry in program_of(job).items() if entry[0] != "configuration"]
+        settings = job.size, job.expert, search.endless, search.steady, job.task, of_code, device()
+        self._seconds: list[float] = []  # of each program that this process has compiled
+        self._tracing = Lock()  # Python's part of compiling gains nothing from threads, and shares what it caches
+        self._programs = {_claim(folder, program, repr(settings)): program for program in programs}
+
+    def compile_next(self) -> tuple[int, int] | None:
+        """Compile the first program that no process has compiled or compiles now; return `compiled` then.
+
+        Returns None if there was no such program.
+        """
+        for path, program in self._programs.items():
+            with suppress(OSError):  # a folder that cannot be written to, or has no locks: compile when needed
+                if not _is_done(path) and (file := try_claim(path)):
+                    with file:
+                        if not _is_done(path):  # by now
+                            self._compile(program)
+                            file.truncate(0)
+                            file.write(DONE)
+                    return self.compiled
+        return None
+
+    def _compile(self, program: Program) -> None:
+        with self._tracing:
+            begun = time.perf_counter()
+            lowered = program.lower()
+        lowered.compile()
+        self._seconds.append(time.perf_counter() - begun)
+
+    @property
+    def compiling(self) -> float:
+        """Seconds that this process has compiled, in all its threads."""
+        return sum(self._seconds)
+
+    @property
+    def left(self) -> bool:
+        """Whether a program is not compiled yet."""
+        done, programs = self.compiled
+        return done < programs
+
+    @property
+    def compiled(self) -> tuple[int, int]:
+        """Number of compiled programs, and of all."""
+        return sum(map(_is_done, self._programs)), len(self._programs)
+
+
+def _claim(folder: Path, program: Program, settings: str) -> Path:
+    return folder / f"{hashlib.sha256(f'{program.name} {settings}'.encode()).hexdigest()}.ahead"
+
+
+def _is_done(path: Path) -> bool:
+    return path.exists() and path.stat().st_size == len(DONE)

@@ -1,0 +1,26 @@
+"""The choice of a job's executor: small jobs run in the command's own process, large ones on Ray's workers."""
+
+from dataclasses import replace
+
+from levelproof.configs.numbers import parse_count
+from levelproof.configs.schema import JobConfig
+from levelproof.pipeline.jobs.address import ray_address
+
+SMALL = 2  # untimed work units; a process makes them in the time in which Ray and its workers start
+DEFAULT_BUDGET = parse_count(JobConfig.budget, "budget")  # env steps; the search, which it does not limit, takes longer
+
+
+def runs_here(job: JobConfig, levels: int) -> bool:
+    """Return whether the command's own process makes the job's levels.
+
+    Args:
+        job: its executor decides, unless that is "auto". Then only a job runs here that names no cluster, no GPU and
+            no second worker, and that is small: levels with a larger budget count more.
+        levels: number of levels to make.
+    """
+    if job.executor != "auto":
+        return job.executor == "inline"
+    if ray_address() or job.device == "gpu" or job.workers > 1:
+        return False
+    unit = replace(job, unit=None).levels_per_unit
+    return levels * max(job.env_steps, DEFAULT_BUDGET) <= SMALL * unit * DEFAULT_BUDGET

@@ -1,0 +1,111 @@
+"""The job of `levelproof grow`: ordinary splits from seed files."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from levelproof.configs.compose import compose_job
+from levelproof.configs.schema import GrowConfig
+from levelproof.pipeline.errors import Exit, Failure, UserError
+from levelproof.pipeline.jobs.generate import generate
+from levelproof.pipeline.jobs.progress import say
+from levelproof.pipeline.jobs.schedule import WorkUnit, levels_text
+from levelproof.pipeline.store import quarantine
+from levelproof.pipeline.store.manifest import read_manifest, require_manifest
+from levelproof.pipeline.store.remote import absolute, as_typed, is_remote
+from levelproof.pipeline.store.seed.columns import ROW_GROUP
+from levelproof.pipeline.store.seed.file import is_seed, read_seed, seed_files
+from levelproof.pipeline.store.seed.source import LevelSource
+from levelproof.pipeline.store.seed.write import content_digest
+from levelproof.pipeline.words import many
+
+SETTINGS = ("density", "key_every", "executor", "workers")
+
+
+def grow(source: Path, out: Path, settings: Sequence[str], console: Console) -> Exit:
+    """Grow seed files into the split `out`, or continue to.
+
+    Args:
+        source: a seed file, or a folder of some.
+        out: path of the split.
+        settings: `NAME=VALUE` for names in SETTINGS.
+        console: receives progress and messages.
+
+    Raises:
+        UserError: `source` has no seed file, `out` does not end in their budget and size, a setting is not one of
+            SETTINGS, or as `generate`.
+        Failure: a seed file is damaged or has levels that this program does not make, or as `generate`.
+    """
+    if wrong := [setting for setting in settings if setting.partition("=")[0] not in SETTINGS]:
+        raise UserError(
+            f"{wrong[0]} cannot be set here, the seeds decide it: leave it out; {', '.join(SETTINGS)} may change."
+        )
+    if not is_seed(source):
+        raise UserError(
+            f"There is no seed file at {as_typed(source)}: give a file that `levelproof export SPLIT --format seed` "
+            "wrote, or a folder of some."
+        )
+    manifest = require_manifest(source, [])
+    job = _job(source, out, settings, manifest.config or {})
+    command = ["levelproof", "grow", as_typed(source), "-o", str(out), *settings]
+    code = generate(job, command, console, level_ids=manifest.level_ids.tolist())
+    return max(code, _report(source, out, manifest.level_ids, console))
+
+
+def _job(source: Path, out: Path, settings: Sequence[str], config: dict) -> GrowConfig:
+    """Return the job that grows seed files into `out`."""
+    first = seed_files(source)[0]
+    about, _ = read_seed(first, [])
+    known = LevelSource.of(config, first)
+    size, budget = config["size"], about.budget
+    path = out if is_remote(out) else out.expanduser().absolute()
+    if (path.parent.name, path.name) != (budget, size):
+        raise UserError(
+            f"The seeds have size {size} and budget {budget}, and the split would be {out}: name it so, as in "
+            f"-o data/{budget}/{size}."
+        )
+    chosen = compose_job(settings)
+    return GrowConfig(
+        size=size,
+        budget=budget,
+        out=as_typed(path.parent.parent),
+        level_files=as_typed(absolute(source)),
+        density=chosen.density,
+        key_every=chosen.key_every,
+        executor=chosen.executor,
+        workers=chosen.workers,
+        task=known.rules,
+        grown=json.dumps(config, sort_keys=True),
+    )
+
+
+def _report(source: Path, split: Path, wanted: np.ndarray, console: Console) -> Exit:
+    """Say what was left out, and whether levels here are not those that the seeds were exported from."""
+    manifest = read_manifest(split, ["content_hash"])
+    given_up = [run for left in quarantine.given_up(split, manifest.level_ids).values() for run in left]
+    left_out = np.setdiff1d(wanted, np.concatenate([manifest.level_ids, *(np.arange(a, b + 1) for a, b in given_up)]))
+    if len(left_out):
+        levels = levels_text([WorkUnit(tuple(left_out.tolist()))])
+        say(
+            console,
+            f"Left out: {many(len(left_out), 'level')}, whose first episodes differ here from what the "
+            f"seeds say of them ({levels}).",
+        )
+    drifted = 0
+    for path in seed_files(source):
+        about, rows = read_seed(path, [])
+        ids = rows.column("level_id").to_numpy()
+        for digest, first in zip(about.content, range(0, len(ids), ROW_GROUP), strict=True):
+            some = ids[first : first + ROW_GROUP]
+            if np.isin(some, manifest.level_ids).all():
+                hashes = manifest.table.column("content_hash").take(np.searchsorted(manifest.level_ids, some))
+                drifted += content_digest(hashes.to_pylist()) != digest
+    if drifted:
+        raise Failure(
+            f"The sampler made other levels here than those that {as_typed(source)} was exported from, in "
+            f"{many(drifted, 'row group')}: use the levelproof that wrote it."
+        )
+    return Exit.FAILED if len(left_out) else Exit.DONE

@@ -1,0 +1,78 @@
+"""The folder of a run that makes a policy: what decides the run, its checkpoint and its policy; and the run's bar."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from safetensors.numpy import load, save
+
+from levelproof.experts.networks.saved import CONFIG, Policy, named, save_policy, unnamed
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.store.disk import NotRegular, read_regular
+from levelproof.pipeline.store.files import write
+
+CHECKPOINT, RUN = "checkpoint.safetensors", "run.json"
+T = TypeVar("T")
+
+
+def made(out: Path) -> Path:
+    """Create the folder of a policy. Raise UserError if it cannot be one."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"Cannot write a policy to {out} ({error.strerror}): choose another folder with -o.") from None
+    return out
+
+
+def require_same_run(out: Path, note: dict[str, Any]) -> None:
+    """Raise UserError if `out` holds a run of other settings or data, or a policy of unknown origin."""
+    if (before := note_in(out)) is None:
+        if (out / CONFIG).exists():
+            raise UserError(f"{out} has a policy already: choose another folder with -o.")
+    elif before != note:
+        raise UserError(f"{out} has a run with other settings or levels: repeat its command, or choose another -o.")
+
+
+def note_in(out: Path) -> dict[str, Any] | None:
+    """Return what decides the result of the run in `out`; None: there is none. Raise Failure if it is damaged."""
+    try:
+        return json.loads(read_regular(out / RUN))
+    except (FileNotFoundError, NotADirectoryError):  # `made` refuses a file
+        return None
+    except (OSError, ValueError, RecursionError) as error:
+        raise Failure(f"Cannot read {out / RUN} ({error}): choose another folder with -o.") from None
+
+
+def write_note(out: Path, note: dict[str, Any]) -> None:
+    write(out / RUN, (json.dumps(note, indent=2) + "\n").encode())
+
+
+def continued(out: Path, fresh: T) -> T:
+    """Return the state, a pytree, in the checkpoint of `out`, or `fresh` if it has none."""
+    try:
+        return unnamed(fresh, load(read_regular(out / CHECKPOINT)))
+    except FileNotFoundError:
+        return fresh
+    except NotRegular:
+        raise
+    except Exception as error:  # the library raises types of its own
+        raise Failure(f"The checkpoint in {out} is damaged ({error}): start again with another -o.") from None
+
+
+def keep_run(out: Path, policy: Policy, state: Any) -> None:
+    """Write the policy, then the checkpoint."""
+    save_policy(out, policy)
+    write(out / CHECKPOINT, save(named(state)))
+
+
+@contextmanager
+def shown(console: Console, first: str, total: int, completed: int) -> Iterator[Any]:
+    """Show a bar on a terminal, with the text `first`; yield a function that advances it and changes its text."""
+    columns = BarColumn(), TaskProgressColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(first, total=total, completed=completed)
+        yield lambda count, text: bar.update(task, advance=count, description=text)

@@ -1,0 +1,42 @@
+"""The log of looks at the sealed levels, beside the policy that was measured.
+
+Who chooses among policies by their sealed solve rates has trained on the sealed levels, so whoever publishes a policy
+should say how often it was measured on them.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from levelproof.pipeline.store.disk import read_regular
+from levelproof.pipeline.store.files import write
+
+LOOKS = "looks.jsonl"
+
+
+def log_look(policy: Path, groups: Sequence[Mapping[str, Any]], attempts: int, seed: int) -> int | None:
+    """Add a line to a policy's log; return how many it has. None: the folder cannot be written, and nothing was.
+
+    Args:
+        policy: folder of the policy.
+        groups: what `evaluate` found on each group of sealed levels.
+        attempts: at each level.
+        seed: of the attempts.
+    """
+    rates = {
+        group["levels"]: {"levels": sampled["levels"], "solved": sampled["once"]["rate"]}
+        for group in groups
+        for sampled in [group["of"]["all"]["policy, sampled"]]
+    }
+    look = {"at": datetime.now(UTC).isoformat(timespec="seconds"), "attempts": attempts, "seed": seed, "on": rates}
+    before = b""
+    try:
+        with suppress(FileNotFoundError):
+            before = read_regular(policy / LOOKS)
+        write(policy / LOOKS, before + json.dumps(look).encode() + b"\n")
+    except OSError:
+        return None
+    return before.count(b"\n") + 1

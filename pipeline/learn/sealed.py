@@ -1,0 +1,80 @@
+"""The sealed levels, which measure policies and are never trained on: their ids, contents, labels and experts."""
+
+import json
+import re
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Int
+
+from levelproof.experts.labels import Label
+from levelproof.levelgen.identity.content import DIGITS, VERSION, content_hashes
+from levelproof.levelgen.identity.keys import SAMPLER_VERSION
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.physics.types import Size
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.runtime import cache_folder
+from levelproof.pipeline.store.files import write
+from levelproof.pipeline.words import many
+
+SEALED = range(2_000_000_000, 2_000_002_048)  # their ids
+HASH = re.compile(rf"c{VERSION}:[0-9a-f]{{{DIGITS}}}")
+KNOWN = "sealed.json"  # made by manifests/make_sealed.py
+LETTERS = {Label.SOLVED: "s", Label.TRIVIAL: "t", Label.UNSOLVABLE: "x", Label.UNSOLVED: "u"}
+SUCCESSES = "0123456789abcdefg"  # of 16 attempts
+
+
+class KnownSealed(NamedTuple):
+    """What is known of the sealed levels of a size, in the order of their ids."""
+
+    solved: Bool[np.ndarray, " level"]  # labelled solved at the largest budget
+    successes: dict[str, Int[np.ndarray, " level"]]  # by budget: how many of its 16 attempts a level's expert solved
+
+
+@cache
+def known_sealed(size: str) -> KnownSealed | None:
+    """Return labels and experts' successes of the sealed levels of a size; None if nobody has labelled them yet."""
+    of_size = json.loads(Path(__file__).with_name(KNOWN).read_text())["sizes"].get(size)
+    if of_size is None:
+        return None
+    solved = np.array([*of_size["labels"]]) == LETTERS[Label.SOLVED]
+    read = lambda text: np.array([SUCCESSES.index(digit) for digit in text])
+    return KnownSealed(solved, {name: read(text) for name, text in of_size["successes"].items()})
+
+
+def sealed_hashes(size: Size) -> frozenset[str]:
+    """Return the content hashes of the sealed levels that have room in a size.
+
+    A copy of a sealed level has another id if it comes from a level file. The hashes of each size are kept in the cache
+    folder, because the first sampling compiles for seconds.
+    """
+    names = [name for name, other in SIZES.items() if all(a <= b for a, b in zip(other, size, strict=True))]
+    return frozenset(content_hash for name in names for content_hash in _kept(name))
+
+
+def require_not_sealed(split: Path, ids: Int[np.ndarray, " level"]) -> None:
+    """Raise UserError if a split has sealed ids among these."""
+    if sealed := int(((ids >= SEALED.start) & (ids < SEALED.stop)).sum()):
+        raise UserError(
+            f"{split} has {many(sealed, 'level')} with ids from {SEALED.start} to {SEALED.stop - 1}, which are sealed "
+            f"to measure policies: exclude them, as in where='level_id < {SEALED.start}'."
+        )
+
+
+def _kept(name: str) -> list[str]:
+    folder = cache_folder() / "sealed"
+    path = folder / f"{name}-{SAMPLER_VERSION}-{VERSION}-{SEALED.start}-{len(SEALED)}.json"
+    with suppress(OSError, ValueError, TypeError):  # missing or damaged
+        known = json.loads(path.read_text())
+        if len(known) == len(SEALED) and all(map(HASH.fullmatch, known)):
+            return known
+    hashes = content_hashes(jax.device_get(sample_levels(np.array(SEALED, np.int32), name)))
+    with suppress(OSError):  # the next command hashes them again
+        folder.mkdir(exist_ok=True)
+        write(path, json.dumps(hashes).encode())
+    return hashes

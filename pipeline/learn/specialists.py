@@ -1,0 +1,74 @@
+"""What levels' own experts do, as the rows of a split say, to stand beside a policy for all levels."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+from jaxtyping import Int
+
+from levelproof.experts.labels import Label
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.learn.sealed import known_sealed
+from levelproof.pipeline.learn.solve_rates import Solved
+from levelproof.pipeline.store.manifest import require_manifest
+
+ATTEMPTS = 16  # by which splits rate an expert if their configuration does not say
+
+
+class Specialists(NamedTuple):
+    """The experts of a split."""
+
+    name: str  # for people
+    solved: Solved  # first episodes with sampled actions; an expert that was not needed or found nothing has none
+
+
+def specialists_of(split: Path, level_ids: Int[np.ndarray, " level"], attempts: int) -> Specialists:
+    """Return the rated attempts of the experts of these levels, at most `attempts` of each.
+
+    A level without a rate counts as solved in every attempt if it is trivial, else in none. The order of a level's
+    attempts is drawn, because a row has only their share.
+
+    Raises:
+        UserError: there is no such split, or it lacks a level.
+        Failure: the split is damaged.
+    """
+    manifest = require_manifest(split, ["level_id", "label", "success_rate", "budget"])
+    table, config = manifest.table, manifest.config or {}
+    row_of = {level_id: row for row, level_id in enumerate(table["level_id"].to_pylist())}
+    missing = [level_id for level_id in level_ids.tolist() if level_id not in row_of]
+    if missing:
+        raise UserError(
+            f"{split} lacks {len(missing):,} of the levels, such as {missing[0]}: label them there first, or name "
+            "another split with --experts."
+        )
+    rows = table.take([row_of[level_id] for level_id in level_ids.tolist()])
+    own = config.get("expert", {}).get("attempts", ATTEMPTS)
+    solved = _drawn(successes_of(rows, own), own, attempts)
+    return Specialists(_named(rows["budget"][0].as_py()), solved)
+
+
+def sealed_specialists(size: str, count: int, attempts: int) -> list[Specialists]:
+    """Return the rated attempts of the experts of the first `count` sealed levels, for each budget that is known.
+
+    Their order is drawn as that of `specialists_of`.
+    """
+    known = known_sealed(size)
+    successes = known.successes if known else {}
+    return [Specialists(_named(name), _drawn(each[:count], ATTEMPTS, attempts)) for name, each in successes.items()]
+
+
+def successes_of(rows: pa.Table, attempts: int) -> Int[np.ndarray, " level"]:
+    """Return in how many of its `attempts` each row's expert reached the goal: all if the level is trivial."""
+    rates = rows["success_rate"].fill_null(0.0).to_numpy()
+    rates = np.where(np.array(rows["label"].to_pylist()) == Label.TRIVIAL, 1.0, rates)
+    return np.round(rates * attempts).astype(np.int64)
+
+
+def _named(budget: str) -> str:
+    return f"its own expert, {budget}"
+
+
+def _drawn(successes: Int[np.ndarray, " level"], own: int, attempts: int) -> Solved:
+    solved = np.arange(own) < successes[:, None]
+    return np.random.default_rng(0).permuted(solved, axis=1)[:, :attempts]

@@ -1,0 +1,182 @@
+"""Reinforcement learning of one policy over many levels, with checkpoints from which a run continues bit for bit."""
+
+import hashlib
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from levelproof.configs.convert import plain
+from levelproof.configs.train import TrainConfig
+from levelproof.experts.generalist.curricula import curriculum_of
+from levelproof.experts.generalist.rollout import table_of
+from levelproof.experts.generalist.train import Learner, Programs, TrainingRecipe, UpdateFacts, programs_of
+from levelproof.experts.networks.over_levels import PolicyKind
+from levelproof.experts.networks.saved import WEIGHTS, Policy, policy_folder
+from levelproof.levelgen.task.lanes import Table
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.jobs.progress import say
+from levelproof.pipeline.learn.curves import BLUE, GREEN, Curves, Panel
+from levelproof.pipeline.learn.folder import continued, keep_run, made, note_in, require_same_run, shown, write_note
+from levelproof.pipeline.learn.metrics import Metrics
+from levelproof.pipeline.learn.trained_on import TrainingLevels, levels_for
+from levelproof.pipeline.read.policies import policy_at, require_size
+from levelproof.pipeline.runtime import own_cores, prepare_jax
+from levelproof.pipeline.store.disk import explaining_writes, read_regular
+from levelproof.pipeline.store.locks import only_clone
+from levelproof.pipeline.words import duration
+
+COURSE = Curves(
+    "train/env_steps",
+    "env steps",
+    (
+        Panel("Episodes that reach the goal", {GREEN: "train/solve_rate"}, 1.0),
+        Panel("Entropy, nats", {BLUE: "loss/entropy"}),
+    ),
+    {GREEN: "solve rate", BLUE: "entropy"},
+)
+WITHOUT_EFFECT = ("log", "cores")  # settings that a continued run may change; the number of cores is kept apart
+
+
+def train(config: TrainConfig, out: Path, console: Console) -> None:
+    """Train a policy, or continue to; write it to `out`, and print where it is.
+
+    Raises:
+        UserError: levels, the policy to start from or settings are unusable; `out` is unusable, in use or has another
+            run; or a library is missing.
+        Failure: the data or the checkpoint is damaged.
+    """
+    tell = lambda text: say(console, text)
+    cores = prepared_cores(config, note_in(out))
+    source = levels_for(config, tell)
+    start = policy_at(Path(config.start)) if config.start else None
+    if start:
+        require_size(start, source.levels.size, source.name, "start from one that plays any size")
+    recipe = recipe_of(config, source, start, cores)
+    note = note_of(config, source, cores)
+    params = None if start is None else start.params
+    with explaining_writes(out), only_clone(made(out)) as require_ours:
+        require_same_run(out, note)
+        write_note(out, note)
+        table = table_of(source.levels, recipe.rules)
+        programs = programs_of(recipe, table, params, cores)
+        fresh = programs.begin(table, params)
+        learner = jax.tree.map(lambda x, like: jax.device_put(x, like.sharding), continued(out, fresh), fresh)
+        steps = int(learner.updates) * config.ppo.steps_per_update
+        metrics, done = Metrics(out, COURSE, config.log, note, steps, tell), False
+
+        def save(learner: Learner) -> None:
+            require_ours()
+            fits = source.levels.size if recipe.network.kind is PolicyKind.FLAT else None
+            origin = note | {"env_steps": int(learner.updates) * config.ppo.steps_per_update}
+            keep_run(out, Policy(recipe.network, learner.average, fits, origin), learner)
+
+        try:
+            learner = update_until_done(
+                programs, learner, table, params, recipe, config.interval, save, metrics, console
+            )
+            done = True
+        finally:
+            metrics.close(done)
+        save(learner)
+    tell(f"The policy is in {out}. Next: levelproof evaluate {out}")
+
+
+def prepared_cores(config: TrainConfig, note: dict[str, Any] | None) -> int:
+    """Set JAX up, and return how many devices share the lanes: as many as before if the run continues.
+
+    Raises:
+        UserError: JAX does not show so many.
+    """
+    wanted = int(note["cores"]) if note and "cores" in note else config.cores
+    even = next((cores for cores in range(len(own_cores()), 1, -1) if config.ppo.shares_out(cores)), 1)
+    prepare_jax(devices=wanted or even)
+    if jax.default_backend() != "cpu":
+        return 1
+    there = len(jax.devices())
+    if wanted > there:
+        raise UserError(f"cores is {wanted}, but JAX has been set up for {there} in this process: set cores={there}.")
+    return wanted or min(even, there)
+
+
+def recipe_of(config: TrainConfig, source: TrainingLevels, start: Policy | None, cores: int) -> TrainingRecipe:
+    """Return what decides the programs. Raise UserError if the lanes do not share out over the cores."""
+    try:
+        config.ppo.chunk(cores)
+    except ValueError as error:
+        raise UserError(f"ppo.{error}.") from None
+    rules = replace(source.rules, dense_reward_scale=config.ppo.dense_reward_scale)
+    curriculum = curriculum_of(config.levels, config.curriculum)
+    network = start.network if start else config.network
+    return TrainingRecipe(network, source.levels.size, config.ppo, curriculum, rules, config.seed)
+
+
+def note_of(config: TrainConfig, source: TrainingLevels, cores: int) -> dict[str, Any]:
+    """Return what decides a run's result, as JSON."""
+    settings = {name: value for name, value in plain(config).items() if name not in WITHOUT_EFFECT}
+    weights = policy_folder(config.start) / WEIGHTS
+    start = hashlib.sha256(read_regular(weights)).hexdigest() if config.start else None
+    return {"settings": settings, "levels": source.facts, "start": start, "cores": cores}
+
+
+def update_until_done(
+    programs: Programs,
+    learner: Learner,
+    table: Table,
+    start: Any,
+    recipe: TrainingRecipe,
+    interval: int,
+    save: Callable[[Learner], None],
+    metrics: Metrics,
+    console: Console,
+) -> Learner:
+    """Take the updates that are left; `save` the learner and write metrics every `interval` of them."""
+    last, first, per_update = recipe.ppo.updates, int(learner.updates), recipe.ppo.steps_per_update
+    before, began, aside, recent = metrics.last.get("train/core_seconds", 0.0), time.monotonic(), 0.0, []
+    every = recipe.curriculum.every
+    with shown(console, "compiling", last, first) as show:
+        for update in range(first + 1, last + 1):
+            if every and (update - 1) % every == 0:
+                learner = programs.measure(learner, table)
+            learner, facts = programs.advance(learner, table, start)
+            recent.append(jax.device_get(facts))
+            if update == first + 1:
+                began = time.monotonic()  # compiling does not count
+            rate = (update - first - 1) * per_update / max(time.monotonic() - began - aside, 1e-9)
+            words = f"{update * per_update:,} env steps · {averages(recent)['train/solve_rate']:.1%} solved"
+            if rate:
+                words += f" · {rate:,.0f} env steps/s · about {duration((last - update) * per_update / rate)} left"
+            show(1, words)
+            if update % interval == 0 or update == last:
+                paused = time.monotonic()
+                numbers = {COURSE.step: update * per_update, "train/updates": update} | averages(recent)
+                numbers["train/env_steps_per_second"] = rate
+                numbers["train/core_seconds"] = before + time.process_time()
+                recent = []
+                save(learner)
+                metrics.write(numbers)
+                say(console, words)
+                aside += time.monotonic() - paused
+    return learner
+
+
+def averages(recent: Sequence[UpdateFacts]) -> dict[str, float]:
+    """Return the metrics of some updates; NaN where no episode ended."""
+    total = UpdateFacts(*(np.sum(column) for column in zip(*recent, strict=True)))
+    episodes = total.episodes or np.nan
+    mean = lambda name: float(getattr(total, name) / len(recent))
+    return {
+        "train/episodes": int(total.episodes),
+        "train/solve_rate": float(total.solved / episodes),
+        "train/return": float(total.reward / episodes),
+        "train/episode_steps": float(total.env_steps / episodes),
+        "loss/entropy": mean("entropy"),
+        "loss/value": mean("value_error"),
+        "loss/kl": mean("kl_to_before"),
+        "loss/kl_to_start": mean("kl_to_start"),
+    }

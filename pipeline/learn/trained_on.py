@@ -1,0 +1,69 @@
+"""The levels that a policy is trained on by reinforcement: random ones, those of a split, or of level files."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from levelproof.configs.compose import distributions
+from levelproof.configs.train import CURRICULA, TrainConfig
+from levelproof.levelgen.batching import take
+from levelproof.levelgen.identity.content import content_hashes
+from levelproof.levelgen.level import Level, name_of
+from levelproof.levelgen.sampling.sampler import Sampler, sampler
+from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.learn.measured import is_split, levels_in
+from levelproof.pipeline.learn.sealed import require_not_sealed, sealed_hashes
+from levelproof.pipeline.words import many
+
+
+class TrainingLevels(NamedTuple):
+    """Levels of one size."""
+
+    name: str  # for people
+    levels: Level | Sampler
+    rules: TaskParams
+    facts: dict[str, Any]  # what identifies them, as JSON
+
+
+def levels_for(config: TrainConfig, tell: Callable[[str], None]) -> TrainingLevels:
+    """Return the levels that the settings name; leave out copies of sealed levels, and say so.
+
+    Raises:
+        UserError: there are none, or of several sizes, or sealed ones.
+        Failure: the split is damaged.
+    """
+    if config.levels in CURRICULA:
+        return _random(config)
+    place = Path(config.levels)
+    split = is_split(place)
+    groups = list(levels_in(place, config.where or None if split else None, None, tell))
+    if len(groups) > 1:
+        sizes = ", ".join(name_of(group.levels.size) for group in groups)
+        raise UserError(
+            f"{place} has levels of the sizes {sizes}: train on files of one size, in a folder of their own."
+        )
+    (group,) = groups
+    if split:
+        require_not_sealed(place, group.level_ids)
+    sealed, hashes = sealed_hashes(group.levels.size), content_hashes(group.levels)
+    usable = np.array([each not in sealed for each in hashes])
+    if copies := int((~usable).sum()):
+        tell(f"{place}: {many(copies, 'level')} left out, with the content of sealed levels, which measure policies.")
+    if not usable.any():
+        raise UserError(f"{place} has no level but copies of sealed ones, which measure policies: choose others.")
+    levels = jax.device_put(take(group.levels, np.flatnonzero(usable)))
+    facts = {"levels": str(place), "count": len(levels), "ids": group.level_ids[usable].tolist()}
+    return TrainingLevels(str(place), levels, group.rules, facts)
+
+
+def _random(config: TrainConfig) -> TrainingLevels:
+    try:
+        levels = sampler(config.size, distributions()[config.distribution])
+    except ValueError as error:
+        raise UserError(f"Cannot sample levels: {error}.") from None
+    name = f"random {config.size}"
+    return TrainingLevels(name, levels, DEFAULT_RULES, {"levels": name, "distribution": config.distribution})

@@ -1,0 +1,140 @@
+"""Seed files on a disk or behind a URL: which paths are some, and their bounded reading."""
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.labels import WITNESSED, Label, Source
+from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.bounds import DAMAGE, bounded
+from levelproof.pipeline.store.formats import CONFIG_KEY, HASH_KEY
+from levelproof.pipeline.store.fragment import Fragment, settings_in
+from levelproof.pipeline.store.layout import MANIFEST
+from levelproof.pipeline.store.remote import is_remote, mended
+from levelproof.pipeline.store.seed.columns import (
+    BUDGET_KEY,
+    CONTENT_KEY,
+    ROW_GROUP,
+    SCHEMA,
+    SEED_KEY,
+    SEED_VERSION,
+    SEEDS,
+)
+from levelproof.pipeline.store.seed.packed import MAX_BYTES
+
+SUFFIX = ".parquet"
+STORED = "density=seed"
+BUDGET = r"[A-Za-z0-9._]{1,32}"
+
+
+@dataclass(frozen=True)
+class SeedFile:
+    """What a seed file says of itself."""
+
+    fragment: Fragment
+    budget: str  # as typed
+    content: tuple[str, ...]  # SHA-256 of the content hashes of each row group
+
+
+def is_seed(path: Path) -> bool:
+    """Whether a path names a seed file or a folder of some, and not a split with shards."""
+    return bool(seed_files(path))
+
+
+def seed_files(path: Path) -> list[Path]:
+    """List the seed files at a path, by name; none if it is something else."""
+    if is_remote(path) or not path.is_dir():
+        return [path] if path.suffix == SUFFIX and (is_remote(path) or path.is_file()) else []
+    if (path / MANIFEST).exists():
+        return []
+    return sorted(file for file in path.glob(f"[!.]*{SUFFIX}") if file.is_file())
+
+
+def file_of(source: Path, name: str) -> Path:
+    """Return the seed file that a row of `source` names as its shard."""
+    return source if source.suffix == SUFFIX and not source.is_dir() else source / name
+
+
+def read_seed(
+    path: Path, names: Sequence[str], level_ids: np.ndarray | None = None, compact: bool = False
+) -> tuple[SeedFile, pa.Table]:
+    """Read columns of a seed file, of all rows or, with `level_ids` (ascending), of these levels' row groups at least.
+
+    Raises:
+        Failure: it is missing, damaged, no seed file, or has another version.
+    """
+    try:
+        with bounded(path, SEEDS) as file:
+            metadata = file.metadata
+            version = metadata.get(SEED_KEY, b"?").decode()
+            if version != SEED_VERSION:
+                raise Failure(
+                    f"The file {path} is no seed file that this program reads (its version is {version[:9]!r}, not "
+                    f"{SEED_VERSION}): `levelproof export SPLIT --format seed` writes some."
+                )
+            config, config_hash = settings_in(metadata[CONFIG_KEY], metadata[HASH_KEY].decode())
+            budget, content = metadata[BUDGET_KEY].decode(), json.loads(metadata[CONTENT_KEY])
+            if (
+                not re.fullmatch(BUDGET, budget)
+                or not _are_digests(content)
+                or len(content) != -(-file.rows // ROW_GROUP)
+            ):
+                raise ValueError("its metadata are not those of a seed file")
+            fragment = Fragment(path, config_hash, config, {}, file.rows, True, frozenset({STORED}))
+            wanted = list(dict.fromkeys(["level_id", *names]))
+            table = file.read(wanted, SCHEMA.names, level_ids, compact)
+            _check(table)
+    except FileNotFoundError:
+        raise Failure(f"There is no seed file {path}: `levelproof export SPLIT --format seed` writes one.") from None
+    except PermissionError:
+        raise Failure(f"The seed file {path} cannot be read: check its permissions.") from None
+    except DAMAGE as error:
+        raise damaged_seed(path, error) from error
+    return SeedFile(fragment, budget, tuple(content)), table
+
+
+def damaged_seed(path: Path, error: Exception) -> Failure:
+    """Return the Failure for a seed file that raised `error` when it was read."""
+    reason = str(error) if type(error) is ValueError else type(error).__name__
+    return Failure(f"The seed file {path} is damaged ({reason}): " + mended(path, "copy it again from its source."))
+
+
+def _are_digests(found: Any) -> bool:
+    return isinstance(found, list) and all(isinstance(one, str) and re.fullmatch("[0-9a-f]{64}", one) for one in found)
+
+
+def _check(table: pa.Table) -> None:
+    """Raise ValueError for values that no seed file has."""
+    ids = table.column("level_id").to_numpy()
+    if len(ids) and (ids[0] < 0 or ids[-1] > MAX_LEVEL_ID or not (np.diff(ids.astype(np.int64)) > 0).all()):
+        raise ValueError("its level ids are not ascending ids of levels")
+    columns: dict[str, Any] = {name: table.column(name) for name in table.column_names}
+    for name, known in ("label", {*Label}), ("source", {*Source, None}):
+        if name in columns and not {*columns[name].unique().to_pylist()} <= known:
+            raise ValueError("it has unknown labels or witnesses")
+    if "steps_to_goal" in columns:
+        steps = columns["steps_to_goal"].drop_null().to_numpy()
+        if len(steps) and not 1 <= steps.min() <= steps.max() <= RECORD_STEPS:
+            raise ValueError("its witnesses are longer than a record")
+    if "witness" in columns:
+        _check_lengths(columns["witness"], MAX_BYTES)
+    if {"witness", "label", "steps_to_goal", "checksum"} <= columns.keys():
+        has = np.isin(np.array(columns["label"].to_pylist(), dtype=object), [*WITNESSED])
+        for name in ("witness", "steps_to_goal", "checksum"):
+            if (columns[name].is_valid().to_numpy() != has).any():
+                raise ValueError("its labels do not match its witnesses")
+
+
+def _check_lengths(column: pa.ChunkedArray, most: int) -> None:
+    for chunk in column.chunks:
+        offsets = np.frombuffer(chunk.buffers()[1], np.int32)[chunk.offset : chunk.offset + len(chunk) + 1]
+        if (np.diff(offsets) > most).any():
+            raise ValueError("it has a witness longer than any")

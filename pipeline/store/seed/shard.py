@@ -1,0 +1,131 @@
+"""A seed file as a shard: records are simulated when they are read. Each repeats its first episode."""
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from levelproof.experts.witness.episode import play_episodes, repeat_episodes
+from levelproof.experts.witness.resume import timesteps
+from levelproof.levelgen.level import Level, concatenate_levels, name_of
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.density import Restored
+from levelproof.pipeline.store.fields import arrays_of
+from levelproof.pipeline.store.formats import FIRST_VERSION, Encoding, FieldSpec
+from levelproof.pipeline.store.seed.file import damaged_seed, read_seed, seed_files
+from levelproof.pipeline.store.seed.packed import unpack_witnesses
+from levelproof.pipeline.store.seed.source import LevelSource
+from levelproof.pipeline.store.shard import Part, Shard
+
+COLUMNS = ("label", "steps_to_goal", "witness", "checksum")
+TIME = "record/timestep"
+
+
+class SeedShard(Shard):
+    """One seed file, whose rows stay in memory: some twenty bytes each.
+
+    Attributes:
+        path: path or URL of the file.
+        size: size of its levels.
+        encoding: the task's rules, and the engine's version that its records are from.
+        level_ids: ids of all rows, int32 [row].
+    """
+
+    def __init__(self, path: Path, size: str | None = None) -> None:
+        """Read the seed file at `path`, whose levels must have `size`, if given.
+
+        Raises:
+            Failure: it is missing, damaged or of another size, or this program makes other levels from its ids.
+        """
+        self.path = path
+        about, rows = read_seed(path, COLUMNS, compact=True)
+        config = about.fragment.config
+        self._source = LevelSource.of(config, path)
+        self.size = self._source.size
+        if size not in (None, name_of(self.size)):
+            raise Failure(f"The levels of {path} have size {name_of(self.size)}, and {size} was expected.")
+        engine = config.get("engine_version", FIRST_VERSION)
+        self.encoding = Encoding("witness", rules=self._source.rules, engine_version=engine)
+        self.level_ids: Any = rows.column("level_id").to_numpy()
+        self.steps: np.ndarray = rows.column("steps_to_goal").fill_null(0).to_numpy()
+        self.checksum: np.ndarray = rows.column("checksum").fill_null(0).to_numpy()
+        self.witness: pa.ChunkedArray = rows.column("witness")
+
+    @cached_property
+    def _content(self) -> pa.ChunkedArray:
+        return read_seed(self.path, ["content"])[1].column("content")
+
+    def levels(self, rows: Sequence[int]) -> Level:
+        """Make the levels of these rows: numpy arrays, level axis last.
+
+        Raises:
+            ValueError: their content is missing or invalid.
+        """
+        sampled = self._source.distribution is not None
+        content = [] if sampled else self._content.take(pa.array(rows, pa.int64())).to_pylist()
+        return self._source.levels(self.level_ids[np.asarray(rows)], content)
+
+    def actions(self, rows: Sequence[int]) -> np.ndarray:
+        """Unpack the actions of the first episodes of these rows, [256, 6, level]; zeros after their ends.
+
+        Raises:
+            ValueError: they are invalid, or a row has none.
+        """
+        packed = self.witness.take(pa.array(rows, pa.int64())).to_pylist()
+        if None in packed:
+            raise ValueError("it has no witness for a level that should have one")
+        return unpack_witnesses(packed, self.steps[np.asarray(rows)])
+
+    def restore(self, parts: Sequence[Part], table: Sequence[FieldSpec], places: Sequence[Sequence[int]]) -> Restored:
+        """Simulate rows of seed files. Raises as `Shard.restore`."""
+        seeds: Any = parts
+        try:
+            found = simulate(seeds, table)
+        except ValueError as error:
+            raise damaged_seed(self.path, error) from error
+        back = np.argsort(np.concatenate([np.asarray(mine, int) for mine in places]))
+        return Restored({name: np.moveaxis(x, -1, 0)[back] for name, x in found.arrays.items()}, found.unlike[back])
+
+
+def stored_levels(source: Path, level_ids: np.ndarray) -> Level:
+    """Unpack levels, in the order of their ids, from the content that seed files have of them.
+
+    Raises:
+        Failure: a file is damaged or missing.
+    """
+    found: dict[int, bytes | None] = {}
+    config, path = None, source
+    for path in seed_files(source):
+        about, rows = read_seed(path, ["content"], np.sort(level_ids))
+        config = about.fragment.config
+        found |= dict(zip(rows.column("level_id").to_pylist(), rows.column("content").to_pylist(), strict=True))
+    try:
+        return LevelSource.of(config or {}, path).levels(level_ids, [found.get(i) for i in level_ids.tolist()])
+    except ValueError as error:
+        raise damaged_seed(path, error) from error
+
+
+def simulate(parts: Sequence[tuple[SeedShard, Sequence[int]]], table: Sequence[FieldSpec]) -> Restored:
+    """Make fields of the rows of seed files of one size and one set of rules; level axis last, rows in order.
+
+    Raises:
+        ValueError: a row is invalid.
+    """
+    names = [field.name for field in table]
+    level = concatenate_levels([shard.levels(rows) for shard, rows in parts])
+    arrays = {name: x for name, x in arrays_of(level, "level/").items() if name in names}
+    if all(name in arrays for name in names):
+        return Restored({name: arrays[name] for name in names}, np.full(len(level), -1))
+    join = lambda name: np.concatenate([getattr(shard, name)[np.asarray(rows)] for shard, rows in parts])
+    action = np.concatenate([shard.actions(rows) for shard, rows in parts], -1)
+    steps, checksum = join("steps"), join("checksum")
+    wanted = frozenset(name.removeprefix("record/") for name in names if name.startswith("record/"))
+    made = play_episodes(level, action, steps, parts[0][0].encoding.rules, wanted)
+    whole = {f"record/{name}": repeat_episodes(x, steps) for name, x in made.fields.items()}
+    if TIME in names:
+        whole[TIME] = timesteps(np.arange(1, len(action) + 1)[:, None] % steps == 0)
+    wrong = ~made.reaches | (made.checksum != checksum)
+    return Restored({name: (arrays | whole)[name] for name in names}, np.where(wrong, 0, -1))

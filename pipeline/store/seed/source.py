@@ -1,0 +1,82 @@
+"""Levels of a seed file: sampled from their ids, or unpacked from their content."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from levelproof.configs.convert import typed
+from levelproof.configs.errors import ConfigError
+from levelproof.configs.schema import MAX_FRAME_SKIP, from_files
+from levelproof.levelgen.batching import block_size, blocks
+from levelproof.levelgen.identity.keys import SAMPLER_VERSION
+from levelproof.levelgen.level import Level, concatenate_levels, size_of
+from levelproof.levelgen.sampling.distribution import Distribution
+from levelproof.levelgen.sampling.sampler import CHUNK, check_size, sample_chunk
+from levelproof.levelgen.task.rules import TaskParams
+from levelproof.physics.types import Size
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.formats import FIRST_VERSION
+from levelproof.pipeline.store.seed.worlds import unpack_worlds
+
+
+@dataclass(frozen=True)
+class LevelSource:
+    """What makes the levels of a seed file from its rows, and the rules by which they are played."""
+
+    size: Size
+    distribution: Distribution | None  # None: each row has its level's content
+    rules: TaskParams
+
+    @staticmethod
+    def of(config: Mapping[str, Any], path: Path) -> "LevelSource":
+        """Return the source that a seed file's configuration describes.
+
+        Raises:
+            Failure: this program makes other levels from their ids, or does not accept the settings.
+        """
+        try:
+            rules = typed(TaskParams, config["task"], "task")
+            size = size_of(config["size"])
+            check_size(size)
+            distribution = None if from_files(config) else typed(Distribution, config["distribution"], "distribution")
+            if rules.frame_skip > MAX_FRAME_SKIP:
+                raise ConfigError(f"task.frame_skip is {rules.frame_skip}")
+            if not isinstance(config.get("engine_version", FIRST_VERSION), int):
+                raise ConfigError("engine_version is no number")
+        except (ValueError, KeyError, TypeError) as error:
+            raise Failure(
+                f"The seed file {path} has settings that this levelproof does not accept ({error})."
+            ) from None
+        sampler = config.get("sampler_version")
+        if distribution is not None and sampler != SAMPLER_VERSION:
+            raise Failure(
+                f"The levels of {path} were sampled by version {sampler!r:.9} of the sampler, and this "
+                f"program makes those of version {SAMPLER_VERSION}: use the levelproof that wrote it."
+            )
+        return LevelSource(size, distribution, rules)
+
+    def levels(self, level_ids: Int[np.ndarray, " level"], content: Sequence[bytes | None]) -> Level:
+        """Make levels: numpy arrays, level axis last.
+
+        Args:
+            level_ids: their ids, one or more.
+            content: packed levels, if there is no distribution.
+
+        Raises:
+            ValueError: a content is missing or invalid.
+        """
+        if self.distribution is None:
+            if any(one is None for one in content):
+                raise ValueError("it lacks the content of a level that no id makes")
+            return unpack_worlds([one for one in content if one is not None], self.size)
+        ids = np.asarray(level_ids, np.int32)
+        lanes = block_size(len(ids), CHUNK)
+        parts = [
+            jax.device_get(sample_chunk(ids[some], self.size, self.distribution)) for some in blocks(len(ids), lanes)
+        ]
+        return concatenate_levels(parts)[: len(ids)]

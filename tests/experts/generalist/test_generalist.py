@@ -1,0 +1,94 @@
+"""Parts of training one policy over many levels: advantages, the penalty's decay, and which levels come next."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from levelproof.experts.generalist.config import CurriculumConfig, PPOConfig
+from levelproof.experts.generalist.curricula import UNIFORM, curriculum_of, fresh
+from levelproof.experts.generalist.rollout import Experience, table_of
+from levelproof.experts.generalist.train import _advantages, _averaged, _kl_weight
+from levelproof.experts.policy import divergence, log_probability
+from levelproof.levelgen.level import ACTIONS
+from levelproof.levelgen.sampling.sampler import sample_levels, sampler
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.levelgen.task.rules import DEFAULT_RULES
+from levelproof.pipeline.learn.sealed import SEALED
+
+CONFIG = PPOConfig(discount=0.9, gae_lambda=0.8)
+
+
+def experience(done: list[bool], terminated: list[bool]) -> Experience:
+    """Return one lane's rewards 1, 2, ... and values 10, 20, ..."""
+    time = jnp.arange(1.0, len(done) + 1)[:, None]
+    flags = [jnp.array(each)[:, None] for each in (done, terminated)]
+    return Experience(None, None, None, None, 10 * time, time, *flags)  # type: ignore[arg-type]
+
+
+def test_truncated_episode_bootstraps_and_terminated_one_does_not() -> None:
+    """The step of an open end counts for nothing: its value stands for all that would follow."""
+    last, ended, cut = (
+        np.asarray(_advantages(experience([False, done, False], [False, goal, False]), CONFIG))[:, 0]
+        for done, goal in ((False, False), (True, True), (True, False))
+    )
+    np.testing.assert_allclose(ended, [1 + 0.9 * 20 - 10 + 0.72 * (2 - 20), 2 - 20, 0], rtol=1e-6)
+    np.testing.assert_allclose(cut, [1 + 0.9 * 20 - 10, 0, 0], rtol=1e-6)
+    np.testing.assert_allclose(last, [1 + 0.9 * 20 - 10 + 0.72 * (2 + 0.9 * 30 - 20), 2 + 0.9 * 30 - 20, 0], rtol=1e-6)
+
+
+def test_kl_penalty_waits_for_the_critic_then_falls_to_zero() -> None:
+    config = PPOConfig(critic_updates=10, kl_weight=0.2, kl_updates=100)
+    weights = [float(_kl_weight(config, jnp.int32(update))) for update in (0, 10, 60, 110, 500)]
+    np.testing.assert_allclose(weights, [0.2, 0.2, 0.1, 0, 0], atol=1e-7)
+    assert float(_kl_weight(replace(config, kl_updates=0), jnp.int32(11))) == 0
+
+
+def test_divergence_is_the_mean_log_ratio_of_live_entries() -> None:
+    p, q = jax.random.normal(jax.random.key(0), (2, sum(CHOICES), 1))
+    live = jnp.array([True, False, True, False, False, True])[:, None]
+    assert float(divergence(p, p, live)[0]) == pytest.approx(0, abs=1e-6)
+    actions = jnp.stack(jnp.meshgrid(*map(jnp.arange, CHOICES), indexing="ij")).reshape(ACTIONS, -1)
+    spread = lambda x: jnp.broadcast_to(x, (len(x), actions.shape[1]))
+    log_p, log_q = (log_probability(spread(x), actions, spread(live)) for x in (p, q))
+    all_live = jnp.exp(log_probability(spread(p), actions, jnp.ones_like(spread(live))))
+    assert float(divergence(p, q, live)[0]) == pytest.approx(float((all_live * (log_p - log_q)).sum()), rel=1e-4)
+
+
+def test_average_of_equal_weights_is_exact() -> None:
+    weights = jax.random.normal(jax.random.key(0), (1000,))
+    assert (_averaged(weights, weights, jnp.int32(7), CONFIG) == weights).all()
+
+
+def test_random_levels_are_never_sealed_and_table_levels_are_all_drawn() -> None:
+    ids = np.asarray(fresh(sampler("s"), jax.random.key(0), 100_000))
+    assert ids.min() >= 0
+    assert ids.max() < SEALED.start
+    table = table_of(sample_levels(np.arange(5), "s"), DEFAULT_RULES)
+    assert set(np.asarray(fresh(table, jax.random.key(0), 200)).tolist()) == set(range(5))
+
+
+def test_learnability_keeps_levels_that_are_sometimes_solved() -> None:
+    config = CurriculumConfig(share=0.75, candidates=64, keep=16)
+    curriculum = curriculum_of("learnability", config)
+    table, key = sampler("s"), jax.random.key(1)
+    before = np.asarray(curriculum.draw(table, curriculum.begin(), key, 1000))
+    assert len(np.unique(before)) > 990, "nothing is measured yet: all levels are fresh"
+
+    def attempt(ids, steps, key):
+        assert steps == config.measured_steps
+        number = jnp.arange(len(ids)) % 8  # 2 of 8 levels are solved sometimes, 1 of them as often as not
+        return jnp.full(len(ids), 10), jnp.select([number == 0, number == 1, number == 2], [5, 1, 10], 0)
+
+    assert curriculum.measure
+    state = curriculum.measure(table, attempt, key)
+    candidates = np.asarray(fresh(table, jax.random.split(key)[0], 64))
+    assert set(np.asarray(state.level_index)[:8].tolist()) == set(candidates[::8].tolist())
+    assert int(state.usable) == 16
+    drawn = np.asarray(curriculum.draw(table, state, key, 4000))
+    assert np.isin(drawn, np.asarray(state.level_index)).mean() == pytest.approx(0.75, abs=0.05)
+    never = curriculum.measure(table, lambda ids, steps, key: (jnp.ones(len(ids)), jnp.zeros(len(ids))), key)
+    assert int(never.usable) == 0
+    assert curriculum_of("data/64k/s", CurriculumConfig()) is UNIFORM

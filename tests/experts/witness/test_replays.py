@@ -1,0 +1,25 @@
+"""A witness solves its level on every processor: replaying it gives the same record, bit for bit."""
+
+import json
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from tests.experts.witness.bits import FILE, digests
+from tests.processors import OLD, ROOT, run_on
+
+WITNESSES = np.load(FILE)
+
+
+def test_witnesses_of_the_reference_manifest_give_their_golden_records() -> None:
+    """If the records change, increment SAMPLER_VERSION or ENGINE_VERSION."""
+    rows = pq.read_table(ROOT / "manifests" / "128k-s.parquet").to_pylist()
+    assert WITNESSES["level_id"].tolist() == [row["level_id"] for row in rows if row["label"] == "solved"]
+    assert digests(WITNESSES["level_id"], WITNESSES["action"]) == WITNESSES["digest"].tolist()
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("processor", OLD)
+def test_witnesses_give_the_same_records_on_other_processors(processor: str) -> None:
+    assert json.loads(run_on(processor, "tests.experts.witness.bits")) == WITNESSES["digest"].tolist()

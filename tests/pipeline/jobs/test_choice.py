@@ -1,0 +1,32 @@
+"""Which jobs run in the command's own process, and which on Ray."""
+
+import pytest
+
+from levelproof.pipeline.jobs.choice import runs_here
+from tests.pipeline.made import made_job
+
+HERE, ON_RAY = "executor=inline", "executor=ray"
+
+
+@pytest.mark.parametrize(
+    ("words", "levels"),
+    [((), 64), (("size=m",), 32), (("size=l",), 16), (("budget=256k",), 32), (("budget=5k", "unit=1"), 64)],
+)
+def test_job_runs_here_up_to_a_number_of_levels(words: tuple[str, ...], levels: int) -> None:
+    job = made_job("data", "executor=auto", *words)
+    assert runs_here(job, levels)
+    assert not runs_here(job, levels + 1)
+
+
+@pytest.mark.parametrize("word", ["workers=2", "device=gpu", ON_RAY])
+def test_job_that_asks_for_workers_runs_on_ray(word: str) -> None:
+    assert not runs_here(made_job("data", "executor=auto", word), 1)
+
+
+def test_job_runs_on_the_cluster_that_the_environment_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    job = made_job("data", "executor=auto")
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    assert runs_here(job, 1)
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:9")
+    assert not runs_here(job, 1)
+    assert runs_here(made_job("data", HERE), 10_000)

@@ -1,0 +1,167 @@
+"""Training of a policy by reinforcement on a small real split, on level files and on random levels."""
+
+import json
+import shutil
+from dataclasses import is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+import levelproof
+from levelproof.configs.compose import override_of
+from levelproof.configs.convert import plain
+from levelproof.configs.meanings import comments_in
+from levelproof.configs.train import TrainConfig
+from levelproof.experts.generalist.config import CurriculumConfig, PPOConfig
+from levelproof.pipeline.exchange.level_json import export
+from levelproof.pipeline.learn import sealed
+from levelproof.pipeline.learn import train as module
+from levelproof.pipeline.learn.trained_on import levels_for
+from tests.pipeline.command import ROOT, assert_refused, here
+
+LANES = ("ppo.environments=64", "ppo.horizon=32", "ppo.minibatches=4", "ppo.learning_rate=2e-3", "cores=1")
+TINY = ("network.width=8", "network.depth=1", "network.heads=1")
+PER_UPDATE = 64 * 32
+FILES = ("policy.safetensors", "checkpoint.safetensors", "config.json")
+
+
+def trained(folder: Path, updates: int, *words: str) -> Path:
+    folder.mkdir(exist_ok=True)
+    steps = f"ppo.env_steps={updates * PER_UPDATE}"
+    done = here(["train", "-o", "agent", steps, *LANES, *words], folder)
+    assert done.returncode == 0, done.stderr
+    return folder / "agent"
+
+
+def metrics(out: Path) -> list[dict[str, float]]:
+    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def easy(split: Path) -> tuple[str, ...]:
+    return f"levels={split}", "where=label = 'solved'", *TINY
+
+
+@pytest.fixture(scope="module")
+def agent(easy: tuple[str, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return trained(tmp_path_factory.mktemp("trained"), 60, "interval=10", *easy)
+
+
+def test_solve_rate_rises_on_an_easy_set(agent: Path) -> None:
+    curve = metrics(agent)
+    assert [line["train/env_steps"] for line in curve] == [10 * PER_UPDATE * n for n in range(1, 7)]
+    rate = [line["train/solve_rate"] for line in curve]
+    assert np.mean(rate[-2:]) > np.mean(rate[1:3]) + 0.05, rate  # the first line has none but short episodes
+    assert curve[-1]["train/return"] > curve[1]["train/return"]
+
+
+def test_folder_holds_a_policy_that_loads_and_is_evaluated(agent: Path, split: Path) -> None:
+    policy = levelproof.load_policy(agent)
+    assert policy.origin["env_steps"] == 60 * PER_UPDATE
+    done = here(["evaluate", str(agent), "--on", str(split), "--levels", "8", "--attempts", "2"], agent.parent)
+    assert done.returncode == 0, done.stderr
+    assert (agent / "curves.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_run_that_was_stopped_continues_bit_for_bit(
+    easy: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("interval=2", *easy)
+    whole = trained(tmp_path / "whole", 4, *words)
+    keep = module.keep_run
+
+    def stopped(*arguments: Any) -> None:
+        keep(*arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "keep_run", stopped)
+    (tmp_path / "stopped").mkdir()
+    here(["train", "-o", "agent", f"ppo.env_steps={4 * PER_UPDATE}", *LANES, *words], tmp_path / "stopped")
+    assert load_file(tmp_path / "stopped/agent/checkpoint.safetensors")[".updates"] == 2
+    monkeypatch.undo()
+    out = trained(tmp_path / "stopped", 4, *words)
+    for name in FILES:
+        assert (out / name).read_bytes() == (whole / name).read_bytes()
+    assert metrics(out)[-1]["train/return"] == metrics(whole)[-1]["train/return"]
+
+
+def test_start_keeps_its_weights_while_the_critic_fits(agent: Path, split: Path, tmp_path: Path) -> None:
+    words = (f"levels={split}", f"start={agent}", "ppo.kl_updates=2", "interval=1")
+    frozen = trained(tmp_path / "frozen", 2, *words, "ppo.critic_updates=2")
+    before, after = (load_file(folder / "policy.safetensors") for folder in (agent, frozen))
+    assert all((before[name] == after[name]).all() for name in before)
+    assert all(line["loss/kl_to_start"] < 1e-6 for line in metrics(frozen))
+    values = [name for name in load_file(frozen / "checkpoint.safetensors") if name.startswith(".params.value")]
+    assert values
+    free = trained(tmp_path / "free", 4, *words, "ppo.critic_updates=1")
+    assert any((before[name] != x).any() for name, x in load_file(free / "policy.safetensors").items())
+    kl = [line["loss/kl_to_start"] for line in metrics(free)]
+    assert kl[1] > kl[0]
+    assert kl[3] == 0, "the penalty is over, and the start's logits are not computed any more"
+
+
+@pytest.mark.campaign
+def test_random_levels_are_measured_for_learnability(tmp_path: Path) -> None:
+    words = ("levels=learnability", "curriculum.candidates=64", "curriculum.keep=16", "curriculum.every=2", *TINY)
+    out = trained(tmp_path, 3, "size=s", *words)
+    kept = load_file(out / "checkpoint.safetensors")
+    usable = next(x for name, x in kept.items() if name.endswith("usable"))
+    assert 0 < usable <= 16
+
+
+def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    source = levels_for(TrainConfig(levels=str(split), where="label = 'solved'"), said.append)
+    data = levelproof.open(split, where="label = 'solved'")
+    assert source.facts["ids"] == data.manifest["level_id"].to_pylist()
+    export(split, int(source.facts["ids"][0]), tmp_path / "level.json")
+    of_files = levels_for(TrainConfig(levels=str(tmp_path)), said.append)
+    assert of_files.facts["count"] == 1
+    assert not said
+    first = source.facts["ids"][0]
+    monkeypatch.setattr(sealed, "SEALED", range(first, first + 2))
+    with pytest.raises(levelproof.UserError, match="sealed to measure policies"):
+        levels_for(TrainConfig(levels=str(split), where=""), print)
+    with pytest.raises(levelproof.UserError, match="no level but copies of sealed ones"):
+        levels_for(TrainConfig(levels=str(tmp_path)), print)  # their content, whatever their ids
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["ppo.env_step=3"], "did you mean ppo.env_steps?"),
+        (["levels=learnabilty"], "There are no levels at learnabilty"),
+        (["size=s", "levels=some/split"], "size has no effect"),
+        (["where=label = 'solved'"], "where has no effect on random levels"),
+        (["curriculum.keep=4"], "no effect with levels=uniform"),
+        (["ppo.kl_weight=1"], "no effect without start"),
+        (["start=policy", "network.width=8"], "network.width is that of the policy to start from"),
+        (["distribution=kinetx"], "did you mean kinetix?"),
+        (["size=q"], "Cannot sample levels"),
+        (["start=none"], "There is no policy in none"),
+        (["ppo.environments=500"], "environments is 500"),
+        (["ppo.minibatches=7"], "minibatches is 7"),
+        (["-o", "file"], "Cannot write a policy to file"),
+    ],
+)
+def test_bad_input_is_refused_in_one_sentence(words: list[str], sentence: str, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    assert_refused(here(["train", "cores=1", *words], tmp_path), 2, sentence)
+    assert not (tmp_path / "agent").exists()
+
+
+def test_folder_of_another_run_is_refused(agent: Path, easy: tuple[str, ...], tmp_path: Path) -> None:
+    shutil.copytree(agent, tmp_path / "agent")
+    assert_refused(here(["train", *LANES, *easy, "seed=1"], tmp_path), 2, "has a run with other settings or levels")
+
+
+def test_guide_lists_every_setting_with_its_default_and_meaning() -> None:
+    guide = (ROOT / "docs/finetune.md").read_text()
+    for path, cls in ("", TrainConfig), ("ppo.", PPOConfig), ("curriculum.", CurriculumConfig):
+        for name, comment in comments_in(cls).items():
+            value = getattr(cls(), name)
+            if not is_dataclass(value):
+                assert f"| `{override_of(path + name, plain(value))}` | {comment.beside} |" in guide

@@ -1,0 +1,192 @@
+"""Seed files: splits as ids and witnesses, read, grown and exported again without a changed bit."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import pytest
+from rich.console import Console
+
+import levelproof
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.witness.episode import repeat_episodes
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.pipeline.errors import Exit, UserError
+from levelproof.pipeline.exchange.seed import export_seed
+from levelproof.pipeline.jobs.grow import grow
+from levelproof.pipeline.store.fields import arrays_of
+from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
+from levelproof.pipeline.store.seed.columns import SCHEMA, WRITTEN
+from levelproof.pipeline.store.seed.packed import MAX_RUN, pack_witness, unpack_witnesses
+from levelproof.pipeline.store.seed.worlds import pack_worlds, unpack_worlds
+from levelproof.pipeline.verify.verify import examine
+from tests.pipeline.made import assert_same, honest_split, made_level
+
+ALL = np.ones(len(CHOICES), bool)
+QUIET = Console(quiet=True)
+INLINE = ["executor=inline"]
+COSTS = {"env_steps", "evaluation_steps", "search_steps", "episodes", "learning_curve", "best_return"}
+OTHERWISE = {"shard", "row", "config_hash", "label_reason", "steps_to_first_success", "command", "seconds", *COSTS}
+
+
+@pytest.fixture(scope="module")
+def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return honest_split(tmp_path_factory.mktemp("split"), 16, 3)
+
+
+@pytest.fixture(scope="module")
+def seed(split: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("seed") / "levels.parquet"
+    export_seed(split, None, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def grown(seed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("grown") / "128k/s"
+    assert grow(seed, path, INLINE, QUIET) == Exit.DONE
+    return path
+
+
+def episode(rng: np.random.Generator) -> np.ndarray:
+    """Return random actions whose runs are short or long, some entries idle."""
+    steps, held = int(rng.integers(1, RECORD_STEPS + 1)), int(rng.integers(1, 2 * MAX_RUN))
+    columns = [np.repeat(rng.integers(0, most, steps // held + 1), held)[:steps] for most in CHOICES]
+    return np.stack(columns, 1) * (rng.random(len(CHOICES)) < 0.5)
+
+
+def test_witnesses_unpack_to_the_actions_that_were_packed() -> None:
+    rng = np.random.default_rng(0)
+    episodes = [episode(rng) for _ in range(200)]
+    packed, steps = [pack_witness(one, ALL) for one in episodes], np.array([len(one) for one in episodes])
+    found = unpack_witnesses(packed, steps)
+    for i, one in enumerate(episodes):
+        np.testing.assert_array_equal(found[: len(one), :, i], one)
+        assert not found[len(one) :, :, i].any()
+
+
+def test_the_ten_lines_of_the_guide_decode_a_witness() -> None:
+    (code,) = re.findall(r"^```python\n(.*?)^```", Path("docs/seeds.md").read_text(), re.DOTALL | re.MULTILINE)
+    names: dict[str, Any] = {}
+    exec(code, names)
+    rng = np.random.default_rng(1)
+    for _ in range(100):
+        one = episode(rng)
+        assert names["actions"](pack_witness(one, ALL), len(one)) == one.tolist()
+
+
+def test_pack_witness_drops_dead_entries() -> None:
+    live = np.arange(len(CHOICES)) == 4
+    found = unpack_witnesses([pack_witness(np.ones((9, 6), int), live)], np.array([9]))
+    assert found[:9, :, 0].tolist() == [[0, 0, 0, 0, 1, 0]] * 9
+
+
+def test_worlds_unpack_to_every_bit_of_the_level() -> None:
+    level = made_level("s", 5)
+    assert_same(arrays_of(unpack_worlds(pack_worlds(level), level.size)), arrays_of(level))
+
+
+def test_seed_file_opens_with_the_rows_and_first_episodes_of_its_split(split: Path, seed: Path) -> None:
+    ours, theirs = levelproof.open(seed), levelproof.open(split)
+    assert (ours.rules, ours.size) == (theirs.rules, theirs.size)
+    assert ours.fingerprint == theirs.fingerprint
+    indices, steps = np.arange(len(ours)), ours.manifest["steps_to_goal"].to_numpy()
+    a, b = (data.read(indices, fields=["level", "record"]) for data in (ours, theirs))
+    for name, values in b.fields.items():
+        for i in indices:
+            some = slice(None) if name.startswith("level/") else slice(steps[i])
+            if name != "record/action":  # those of dead entries are 0
+                assert a.fields[name][i][some].tobytes() == values[i][some].tobytes(), name
+    first = np.arange(RECORD_STEPS)[:, None] < steps
+    np.testing.assert_array_equal(
+        np.where(first, a.goal.T, False), np.arange(RECORD_STEPS)[:, None] == steps - 1, "the end of the first episode"
+    )
+    np.testing.assert_array_equal(a.observation[0, : steps[0]], b.observation[0, : steps[0]])
+
+
+def test_seed_records_repeat_their_first_episode(seed: Path) -> None:
+    data = levelproof.open(seed)
+    batch = data.read(np.arange(len(data)), fields=["record"], observation=None)
+    steps = data.manifest["steps_to_goal"].to_numpy()
+    for name, values in batch.fields.items():
+        rows = np.moveaxis(values, 0, -1)
+        assert_same({name: repeat_episodes(rows, steps)}, {name: rows})
+
+
+def test_seed_manifest_has_the_columns_of_its_split(split: Path, seed: Path) -> None:
+    ours, theirs = read_manifest(seed).table, read_manifest(split).table
+    assert ours.schema == theirs.schema
+    for name in set(theirs.column_names) - OTHERWISE:
+        assert ours[name].to_pylist() == theirs[name].to_pylist(), name
+    chosen = read_manifest(seed, ["content_hash", "row"], [3, 20]).table
+    assert chosen.to_pylist() == ours.take([3, 20]).select(["level_id", "content_hash", "row"]).to_pylist()
+
+
+def test_grown_split_is_sound_and_exports_to_the_same_bytes(seed: Path, grown: Path, tmp_path: Path) -> None:
+    findings = examine(grown)
+    assert not findings.wrong
+    assert findings.witnesses == findings.same_bits > 10
+    export_seed(grown, None, tmp_path / "again.parquet")
+    assert (tmp_path / "again.parquet").read_bytes() == seed.read_bytes()
+    differing = {"shard", "row"}
+    ours, theirs = (read_manifest(path).table.drop_columns([*differing]) for path in (grown, seed))
+    assert ours.to_pylist() == theirs.to_pylist()
+
+
+def test_grow_continues_and_takes_a_folder_of_parts(seed: Path, split: Path, grown: Path, tmp_path: Path) -> None:
+    parts = tmp_path / "parts"
+    export_seed(split, "level_id < 20", parts / "part-000.parquet")
+    export_seed(split, "level_id >= 20", parts / "part-001.parquet")
+    assert levelproof.open(parts).fingerprint == levelproof.open(seed).fingerprint
+    out = tmp_path / "128k/s"
+    assert grow(parts / "part-000.parquet", out, [*INLINE, "density=witness"], QUIET) == Exit.DONE
+    assert len(read_manifest(out).level_ids) == 20
+    assert grow(parts, out, [*INLINE, "density=witness"], QUIET) == Exit.DONE
+    kept = ["level_id", "label", "content_hash", "label_reason", "config_hash"]
+    assert read_manifest(out, kept).table.to_pylist() == read_manifest(grown, kept).table.to_pylist()
+    before = [path.stat().st_mtime_ns for path in fragment_paths(out)]
+    assert grow(parts, out, [*INLINE, "density=witness"], QUIET) == Exit.DONE
+    assert [path.stat().st_mtime_ns for path in fragment_paths(out)] == before
+
+
+def rewritten(seed: Path, path: Path, **columns: Any) -> Path:
+    """Write a copy of a seed file in which these columns are others."""
+    table = pq.read_table(seed)
+    for name, values in columns.items():
+        at = SCHEMA.get_field_index(name)
+        table = table.set_column(at, SCHEMA.field(at), pa.array(values, SCHEMA.field(at).type))
+    with pq.ParquetWriter(path, SCHEMA, **WRITTEN) as writer:
+        writer.write_table(table)
+        stored = pq.read_metadata(seed).metadata
+        writer.add_key_value_metadata({key: value for key, value in stored.items() if key != b"ARROW:schema"})
+    return path
+
+
+def test_grow_leaves_out_levels_whose_bits_differ(
+    seed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = pq.read_table(seed)
+    sums = table["checksum"].to_pylist()
+    wrong = pc.index(table["label"], "solved").as_py()
+    sums[wrong] ^= 1
+    path, out = rewritten(seed, tmp_path / "wrong.parquet", checksum=sums), tmp_path / "128k/s"
+    assert grow(path, out, INLINE, Console(stderr=True)) == Exit.FAILED
+    assert len(read_manifest(out).level_ids) == table.num_rows - 1
+    told = " ".join(capsys.readouterr().err.split())
+    assert "Left out: 1 level," in told
+    assert f"(level {table['level_id'][wrong]})" in told
+    with pytest.warns(levelproof.EngineDiffers):
+        levelproof.open(path)[0]
+
+
+def test_grow_refuses_another_name_and_foreign_settings(seed: Path, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="-o data/128k/s"):
+        grow(seed, tmp_path / "256k/s", INLINE, QUIET)
+    with pytest.raises(UserError, match="the seeds decide it"):
+        grow(seed, tmp_path / "128k/s", ["size=m"], QUIET)
+    with pytest.raises(UserError, match="There is no seed file at"):
+        grow(tmp_path / "none.parquet", tmp_path / "128k/s", INLINE, QUIET)
