@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from levelproof.pipeline.dataset.dataset import Dataset as Dataset
     from levelproof.pipeline.dataset.dataset import open as open
     from levelproof.pipeline.dataset.environment import make as make
+    from levelproof.pipeline.dataset.sample import sample_data as sample_data
     from levelproof.pipeline.errors import Failure as Failure
     from levelproof.pipeline.errors import LevelproofError as LevelproofError
     from levelproof.pipeline.errors import StoreFailure as StoreFailure
@@ -84,6 +85,7 @@ HOME = {
     "read_manifest": "levelproof.pipeline.store.manifest",
     "replay": "levelproof.experts.witness.witness",
     "Sampler": "levelproof.levelgen.sampling.sampler",
+    "sample_data": "levelproof.pipeline.dataset.sample",
     "sample_levels": "levelproof.levelgen.sampling.sampler",
     "sampler": "levelproof.levelgen.sampling.sampler",
     "save_policy": "levelproof.experts.networks.saved",

@@ -15,6 +15,7 @@ from levelproof.configs.compose import compose_job
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.pictures.palette import palette_css
 from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.pipeline.dataset.sample import SAMPLE
 from levelproof.pipeline.look.gallery.gallery import SITE
 from levelproof.pipeline.store.fields import arrays_of
 
@@ -65,6 +66,15 @@ def test_seeds_grow_to_the_states_of_their_checksums(rows: int) -> None:
         batch = data.read(some, observation=None)
     steps = data.manifest["steps_to_goal"].to_numpy()[some]
     assert batch.goal[np.arange(rows), steps - 1].all()
+
+
+def test_sample_data_is_the_first_levels_of_the_seeds() -> None:
+    """The file is a cut of the committed seeds, small enough for the wheel."""
+    assert SAMPLE.stat().st_size < 400_000
+    everything = pq.read_table(FOLDER / "256k" / "s" / "part-000.parquet")
+    assert pq.read_table(SAMPLE).equals(everything.slice(0, 10_000))
+    data = levelproof.sample_data(where="steps_to_goal < 64")
+    assert data.read([0, 1]).goal.any(1).all()
 
 
 @pytest.mark.slow
