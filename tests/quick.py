@@ -15,6 +15,7 @@ BRIEF = (
     "tests/levelgen/task/",
     "tests/pipeline/dataset/",
     "tests/pipeline/exchange/",
+    "tests/pipeline/learn/test_train",
     "tests/pipeline/look/",
     "tests/pipeline/play/",
     "tests/pipeline/read/",

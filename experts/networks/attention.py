@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from levelproof.experts.networks.layers import POLICY_GAIN, SUMMARY
+from levelproof.experts.networks.layers import POLICY_GAIN, SUMMARY, maximum
 from levelproof.experts.networks.relations import EntityTables
 from levelproof.levelgen.task.actions import MOTOR_CHOICES, THRUSTER_CHOICES
 
@@ -111,7 +111,7 @@ class AttentionPolicy(nn.Module):
             x = AttentionBlock(self.width, self.heads, name=f"block_{i}")(x, tables.active, tables.linked)
         x = _normalised(x)
         mean = (x * tables.active).sum(1) / jnp.maximum(tables.active.sum(0), 1)
-        summary = jnp.concatenate([mean, jnp.where(tables.active, x, HIDDEN_BY_MASK).max(1)])
+        summary = jnp.concatenate([mean, maximum(jnp.where(tables.active, x, HIDDEN_BY_MASK))])
         summary = nn.relu(OnColumns(self.width, name="summary")(summary))
         self.sow(*SUMMARY, summary)
         joints, thrusters = len(tables.motors), len(tables.thrusts)

@@ -1,4 +1,4 @@
-"""Layers on columns, and their initial kernels.
+"""Layers on columns, their initial kernels, and a maximum.
 
 Lanes are last, as in the engine: a layer is `kernel @ x`, and all else is a dense loop over lanes.
 """
@@ -51,3 +51,16 @@ class Dense(nn.Module):
         kernel = self.param("kernel", orthogonal(self.gain), (self.units, x.shape[0]))
         bias = self.param("bias", nn.initializers.zeros, (self.units,))
         return kernel @ x + bias[:, None]
+
+
+def maximum(x: Float[Array, "unit token lane"]) -> Float[Array, "unit lane"]:
+    """Return the maximum over tokens, whose gradient goes to one of them.
+
+    The gradient of `jnp.max` divides by how many tokens equal the maximum. XLA may compute them once more for that, and
+    round differently: none is equal then, and the gradient is NaN.
+    """
+    while x.shape[1] > 1:
+        half = x.shape[1] // 2
+        first, second, rest = x[:, :half], x[:, half : 2 * half], x[:, 2 * half :]
+        x = jnp.concatenate([jnp.where(first >= second, first, second), rest], 1)
+    return x[:, 0]

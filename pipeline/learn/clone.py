@@ -21,7 +21,15 @@ from levelproof.pipeline.dataset.subsets import TRAIN, VALIDATION, in_subset
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.learn.curves import BLUE, GREEN, Curves, Panel
-from levelproof.pipeline.learn.folder import continued, keep_run, made, require_same_run, shown, write_note
+from levelproof.pipeline.learn.folder import (
+    continued,
+    keep_run,
+    made,
+    require_finite,
+    require_same_run,
+    shown,
+    write_note,
+)
 from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.pool import Feed, PartedSplit, Transitions, validation_batches
 from levelproof.pipeline.learn.sealed import require_not_sealed, sealed_hashes
@@ -130,7 +138,11 @@ def train(
     metrics: Metrics,
     console: Console,
 ) -> Imitation:
-    """Take the updates that are left; validate, and `save` the state, every `config.interval` of them."""
+    """Take the updates that are left; validate, and `save` the state, every `config.interval` of them.
+
+    Raises:
+        Failure: the weights have diverged.
+    """
     last, first, recent, began, aside = config.train.updates, int(state.updates), [], time.monotonic(), 0.0
     with shown(console, "reading levels", last, first) as show:
         feed = Feed(sources, config, lambda count: show(0, f"reading {count} levels"))
@@ -150,6 +162,7 @@ def train(
                 paused = time.monotonic()
                 numbers = {COURSE.step: update, "bc/samples_per_second": rate * config.train.batch}
                 numbers |= averages("", recent) | validated(state, held, config)
+                require_finite(numbers["bc/loss"], "train.learning_rate")
                 recent = []
                 save(state)
                 metrics.write(numbers)

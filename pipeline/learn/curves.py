@@ -53,7 +53,7 @@ def _panel(
     metrics: Sequence[Mapping[str, float]], curves: Curves, panel: Panel, corner: tuple[float, float]
 ) -> list[str]:
     (left, low), steps = corner, np.array([each[curves.step] for each in metrics])
-    values = {colour: np.array([each[name] for each in metrics]) for colour, name in panel.lines.items()}
+    values = {colour: np.array([each.get(name, np.nan) for each in metrics]) for colour, name in panel.lines.items()}
     finite = [y[np.isfinite(y)] for y in values.values()]
     top = panel.top or max([1e-3, *np.concatenate(finite)])
     last = max([1, *steps])

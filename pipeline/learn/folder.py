@@ -1,6 +1,7 @@
 """The folder of a run that makes a policy: what decides the run, its checkpoint and its policy; and the run's bar."""
 
 import json
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -61,6 +62,15 @@ def continued(out: Path, fresh: T) -> T:
         raise
     except Exception as error:  # the library raises types of its own
         raise Failure(f"The checkpoint in {out} is damaged ({error}): start again with another -o.") from None
+
+
+def require_finite(loss: float, setting: str) -> None:
+    """Raise Failure if a loss is not a number, because the weights are not either, and must not be kept."""
+    if not math.isfinite(loss):
+        raise Failure(
+            f"The loss is {loss}, so the weights have diverged: start again with a smaller {setting} and another -o "
+            "(the checkpoint is that of the last interval)."
+        )
 
 
 def keep_run(out: Path, policy: Policy, state: Any) -> None:

@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from levelproof.pipeline.jobs.log import GuardedLog, require_library, writer_of
 from levelproof.pipeline.learn.curves import Curves, draw_curves
 from levelproof.pipeline.store.disk import read_regular
@@ -44,8 +46,10 @@ class Metrics:
             self._log.open(lambda: writer_of(log, folder / LOG, curves.step, folder.name, settings))
 
     def write(self, numbers: Mapping[str, float]) -> None:
+        """Append a line with the numbers that exist: NaN stands for one that does not, and is not JSON."""
+        numbers = {name: number for name, number in numbers.items() if np.isfinite(number)}
         with self._path.open("a") as file:
-            file.write(json.dumps(dict(numbers)) + "\n")
+            file.write(json.dumps(numbers) + "\n")
         self._log.use(lambda writer: writer.write(numbers))
         self._draw()
 

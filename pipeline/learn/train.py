@@ -22,7 +22,16 @@ from levelproof.levelgen.task.lanes import Table
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.learn.curves import BLUE, GREEN, Curves, Panel
-from levelproof.pipeline.learn.folder import continued, keep_run, made, note_in, require_same_run, shown, write_note
+from levelproof.pipeline.learn.folder import (
+    continued,
+    keep_run,
+    made,
+    note_in,
+    require_finite,
+    require_same_run,
+    shown,
+    write_note,
+)
 from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.trained_on import TrainingLevels, levels_for
 from levelproof.pipeline.read.policies import policy_at, require_size
@@ -135,7 +144,11 @@ def update_until_done(
     metrics: Metrics,
     console: Console,
 ) -> Learner:
-    """Take the updates that are left; `save` the learner and write metrics every `interval` of them."""
+    """Take the updates that are left; `save` the learner and write metrics every `interval` of them.
+
+    Raises:
+        Failure: the weights have diverged.
+    """
     last, first, per_update = recipe.ppo.updates, int(learner.updates), recipe.ppo.steps_per_update
     before, began, aside, recent = metrics.last.get("train/core_seconds", 0.0), time.monotonic(), 0.0, []
     every = recipe.curriculum.every
@@ -148,7 +161,9 @@ def update_until_done(
             if update == first + 1:
                 began = time.monotonic()  # compiling does not count
             rate = (update - first - 1) * per_update / max(time.monotonic() - began - aside, 1e-9)
-            words = f"{update * per_update:,} env steps · {averages(recent)['train/solve_rate']:.1%} solved"
+            words, solved = f"{update * per_update:,} env steps", averages(recent)["train/solve_rate"]
+            if np.isfinite(solved):
+                words += f" · {solved:.1%} solved"
             if rate:
                 words += f" · {rate:,.0f} env steps/s · about {duration((last - update) * per_update / rate)} left"
             show(1, words)
@@ -157,6 +172,7 @@ def update_until_done(
                 numbers = {COURSE.step: update * per_update, "train/updates": update} | averages(recent)
                 numbers["train/env_steps_per_second"] = rate
                 numbers["train/core_seconds"] = before + time.process_time()
+                require_finite(numbers["loss/value"], "ppo.learning_rate")
                 recent = []
                 save(learner)
                 metrics.write(numbers)

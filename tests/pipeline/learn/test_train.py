@@ -19,6 +19,7 @@ from levelproof.experts.generalist.config import CurriculumConfig, PPOConfig
 from levelproof.pipeline.exchange.level_json import export
 from levelproof.pipeline.learn import sealed
 from levelproof.pipeline.learn import train as module
+from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.trained_on import levels_for
 from tests.pipeline.command import ROOT, assert_refused, here
 
@@ -58,6 +59,23 @@ def test_solve_rate_rises_on_an_easy_set(agent: Path) -> None:
     assert curve[-1]["train/return"] > curve[1]["train/return"]
 
 
+def test_metrics_leave_out_numbers_that_do_not_exist(tmp_path: Path) -> None:
+    """No episode may end in an interval, and then there is no solve rate. JSON has no NaN."""
+    log = Metrics(tmp_path, module.COURSE, "none", {}, 0, print)
+    log.write({module.COURSE.step: 1, "loss/value": 0.5, "train/solve_rate": np.nan})
+    assert metrics(tmp_path) == [{module.COURSE.step: 1, "loss/value": 0.5}]
+    assert (tmp_path / "curves.png").exists()
+
+
+@pytest.mark.campaign
+def test_diverged_weights_are_not_kept(easy: tuple[str, ...], tmp_path: Path) -> None:
+    lanes = [word for word in LANES if "learning_rate" not in word]
+    steps = f"ppo.env_steps={2 * PER_UPDATE}"
+    done = here(["train", "-o", "agent", steps, "ppo.learning_rate=1e30", *lanes, *easy], tmp_path)
+    assert_refused(done, 1, "the weights have diverged", "a smaller ppo.learning_rate")
+    assert not (tmp_path / "agent" / "policy.safetensors").exists()
+
+
 def test_folder_holds_a_policy_that_loads_and_is_evaluated(agent: Path, split: Path) -> None:
     policy = levelproof.load_policy(agent)
     assert policy.origin["env_steps"] == 60 * PER_UPDATE
@@ -88,19 +106,27 @@ def test_run_that_was_stopped_continues_bit_for_bit(
     assert metrics(out)[-1]["train/return"] == metrics(whole)[-1]["train/return"]
 
 
-def test_start_keeps_its_weights_while_the_critic_fits(agent: Path, split: Path, tmp_path: Path) -> None:
-    words = (f"levels={split}", f"start={agent}", "ppo.kl_updates=2", "interval=1")
-    frozen = trained(tmp_path / "frozen", 2, *words, "ppo.critic_updates=2")
-    before, after = (load_file(folder / "policy.safetensors") for folder in (agent, frozen))
-    assert all((before[name] == after[name]).all() for name in before)
-    assert all(line["loss/kl_to_start"] < 1e-6 for line in metrics(frozen))
-    values = [name for name in load_file(frozen / "checkpoint.safetensors") if name.startswith(".params.value")]
-    assert values
-    free = trained(tmp_path / "free", 4, *words, "ppo.critic_updates=1")
-    assert any((before[name] != x).any() for name, x in load_file(free / "policy.safetensors").items())
-    kl = [line["loss/kl_to_start"] for line in metrics(free)]
-    assert kl[1] > kl[0]
-    assert kl[3] == 0, "the penalty is over, and the start's logits are not computed any more"
+def test_start_keeps_its_weights_while_the_critic_fits(
+    agent: Path, split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept: list[dict[str, np.ndarray]] = []  # after each update
+    keep = module.keep_run
+
+    def noted(out: Path, *arguments: Any) -> None:
+        keep(out, *arguments)
+        kept.append(load_file(out / "policy.safetensors"))
+
+    monkeypatch.setattr(module, "keep_run", noted)
+    words = (f"levels={split}", f"start={agent}", "ppo.critic_updates=2", "ppo.kl_updates=2", "interval=1")
+    curve = metrics(trained(tmp_path, 5, *words))
+    before = load_file(agent / "policy.safetensors")
+    same = [all((weights[name] == before[name]).all() for name in before) for weights in kept[:5]]
+    assert same == [True, True, False, False, False]
+    kl = [line["loss/kl_to_start"] for line in curve]
+    assert max(kl[:2]) < 1e-6
+    assert kl[3] > max(kl[:2])
+    assert kl[4] == 0, "the penalty is over, and the start's logits are not computed any more"
+    assert any(name.startswith(".params.value") for name in load_file(tmp_path / "agent/checkpoint.safetensors"))
 
 
 @pytest.mark.campaign
