@@ -19,10 +19,10 @@ EXAMPLE = "levelproof settings thruster"
 INDENT = 34  # column at which meanings start
 INTRODUCTION = """# Settings
 
-Every setting of `levelproof generate`, with its default, as one types it: `levelproof generate size=m budget=64k`. \
-`levelproof settings WORD` finds them on the command line. Names in brackets and parentheses are where the reference, \
-Kinetix 3.0.2, has the number. This page is written by `levelproof settings --markdown`, from the comments beside the \
-fields of the dataclasses.
+Every setting of `levelproof generate` with its default, as typed on the command line: `levelproof generate size=m \
+budget=64k`. `levelproof settings WORD` searches them. A name in brackets or parentheses is the field or function of \
+the reference, Kinetix 3.0.2, that has the number. `levelproof settings --markdown` writes this page, from the \
+comments on the dataclasses' fields.
 """
 
 
