@@ -147,7 +147,7 @@ def check_budget(budget: int, config: ExpertConfig, stopping: StopConfig) -> Non
     if budget < config.steps_per_update:
         raise ValueError(
             f"budget is {budget}: one update of an expert takes {config.steps_per_update} env steps "
-            f"({config.environments} environments x {config.horizon}): give at least that many"
+            f"({config.environments} environments x {config.horizon}): set at least that many"
         )
     if budget > MAX_COUNTED:
         raise ValueError(f"budget is {budget}: the maximum is {MAX_COUNTED} env steps")

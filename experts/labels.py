@@ -42,7 +42,7 @@ MADE_BY = {
     Source.SCOUT: "actions of random play",
     Source.SEARCH: "actions of the search",
 }
-UNTRAINED = "no search reached the goal, and no expert was asked for"
+UNTRAINED = "no search reached the goal, and the procedure trains no expert"
 DIVERGED = "stopped being finite"  # in the reasons of levels whose experts diverged
 WITNESSED = frozenset({Label.SOLVED, Label.TRIVIAL})  # labels that need a witness
 TRAINED = frozenset({Label.SOLVED, Label.UNSOLVED})  # labels of levels that need an expert
@@ -107,7 +107,7 @@ def trivial_reason(steps: int) -> str:
 
 ARGUMENTS = {
     Proof.NOTHING_ACTS: "no action has an effect",
-    Proof.GOAL_STANDS: "no green and blue body that could touch ever move",
+    Proof.GOAL_STANDS: "no green or blue body that could touch the other colour ever moves",
 }
 
 

@@ -122,7 +122,9 @@ def load_policy(folder: str | os.PathLike[str]) -> Policy:
             raise FileNotFoundError
         config = json.loads((path / CONFIG).read_text())
         if config["format"] != FORMAT:
-            raise PolicyError(f"The policy {path} has format {config['format']}, this version reads {FORMAT}: update.")
+            raise PolicyError(
+                f"The policy {path} has format {config['format']}, but this levelproof reads {FORMAT}: update it."
+            )
         shape = config["network"]
         network = NetworkConfig(**shape | {"kind": PolicyKind(shape["kind"])})
         size = None if config["size"] is None else size_of(config["size"])

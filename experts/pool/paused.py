@@ -17,4 +17,4 @@ class Paused(NamedTuple):
     pending: Pending
     evaluated_rollouts: int  # of finished evaluations
     evaluations: list[Evaluation]  # those that solved the level
-    found: SearchFindings  # of its one level
+    found: SearchFindings  # of its only level

@@ -163,7 +163,7 @@ class TrainingRun:
         return replace(result, ledger=ledger)
 
     def _attempted(self, trained: Sequence[TrainedLevel]) -> dict[int, tuple[float, int]]:
-        """Measure experts' success rates; return each with its env steps, by index among `left`."""
+        """Measure experts' success rates; return (rate, env steps it took) by index into `left`."""
         policies = {
             i: level.policy
             for i, (index, level) in enumerate(zip(self.left, trained, strict=True))

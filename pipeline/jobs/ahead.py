@@ -1,4 +1,4 @@
-"""A job's programs, compiled before its levels come: each by one worker of a machine, those that take longest first."""
+"""Compiling a job's programs before its first level: one worker of a machine compiles each, the slowest one first."""
 
 import hashlib
 import time
@@ -21,8 +21,8 @@ DONE = b"compiled"  # content of the claim of a compiled program
 class Ahead:
     """The programs of a job, of which this process compiles those that no other process of this machine does.
 
-    Threads may share it: XLA compiles their programs side by side. Whatever needs a program that another process
-    compiles at this moment waits for it (`claims.share_compiling`).
+    Threads may share it: XLA compiles their programs side by side. A caller that needs a program which another process
+    is compiling waits for it (`claims.share_compiling`).
     """
 
     def __init__(self, job: JobConfig, pool: Pool) -> None:

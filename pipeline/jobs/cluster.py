@@ -101,12 +101,12 @@ def _reason(error: RayError) -> str:
 
 
 def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board: Board, stop: Stop) -> None:
-    """Run all units on Ray workers, or until `stop` is asked for.
+    """Run all units on Ray workers, or until a stop is requested.
 
     Raises:
         UserError: the cluster of RAY_ADDRESS cannot be reached.
         Failure: no worker can start.
-        KeyboardInterrupt: `stop` was asked for; workers have committed what they could.
+        KeyboardInterrupt: a stop was requested; workers have committed all levels that were decided.
     """
     with connected(), stop.heeded():  # in this order: Ray sets a handler of its own when it starts
         crew = Crew(with_absolute_paths(job), absolute(split), scheduler, board, served(split))

@@ -139,7 +139,7 @@ def costs_of(split: Path) -> tuple[pa.Table, np.ndarray, np.ndarray]:
     table = read_manifest(split).table
     if not table.num_rows:
         raise Failure(
-            "None of the levels could be made here: run `levelproof generate` with these settings to see why."
+            "No level could be made on this machine: run `levelproof generate` with these settings to see why."
         )
     column = table.column("seconds")
     cost = Seconds(*(pc.struct_field(column, stage).to_numpy().astype(float) for stage in Seconds._fields))  # pyright: ignore[reportAttributeAccessIssue]

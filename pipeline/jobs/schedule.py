@@ -240,10 +240,11 @@ class Scheduler:
         return [UnitOutcome(unit, reason=reason) for unit in self._remove(worker)]
 
     def failed(self, unit: WorkUnit) -> bool:
-        """Count a failed attempt; return whether the unit is now quarantined, else it waits again.
+        """Count a failed attempt; return whether the unit is now quarantined. If not, it waits for another attempt.
 
-        It stays whole, so that an attempt finds what an earlier one has committed. Only the last attempt is made at
-        parts no larger than untimed units, so that a level that always fails takes few others into quarantine.
+        The unit stays whole, so that an attempt finds the levels that an earlier one committed. Only for the last
+        attempt it is split into parts no larger than untimed units, so that a level that always fails takes few others
+        into quarantine.
         """
         self.attempts[unit] = attempts = self.attempts.get(unit, 0) + 1
         if attempts == len(MAX_UNITS):
@@ -333,7 +334,10 @@ def schedule(
     timed: bool,
     origins: Mapping[int, Origin] | None = None,
 ) -> Scheduler:
-    """Return a scheduler of the `levels` levels that are wanted and not done; `unit` and `timed` as in `Scheduler`."""
+    """Return a scheduler of those `wanted` levels, `levels` in number, that are not done.
+
+    `Scheduler` documents `unit` and `timed`.
+    """
     return Scheduler(plan_units(wanted, done, STRETCH if timed else unit, origins), levels, unit, timed)
 
 

@@ -88,7 +88,9 @@ def source_of(split: Path, config: CloneConfig, tell: Callable[[str], None]) -> 
     usable = np.array([content_hash not in sealed for content_hash in hashes])
     copies = int((~usable).sum())
     if copies:
-        tell(f"{split}: {many(copies, 'level')} left out, with the content of sealed levels, which measure policies.")
+        tell(
+            f"{split}: {many(copies, 'level')} left out: copies of sealed levels, which only serve to measure policies."
+        )
     train, kept = (np.flatnonzero(usable & in_subset(hashes, part, config.validation)) for part in (TRAIN, VALIDATION))
     if not len(train) or not len(kept):
         count = len(data) - copies

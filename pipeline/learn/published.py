@@ -115,8 +115,8 @@ def _fetch(folder: Path) -> None:
             return
         reasons.append((done.stderr.strip().splitlines() or ["no message"])[-1])
     raise UserError(
-        f"Cannot fetch the handmade levels ({'; '.join(reasons)}): get `pip download --no-deps {PACKAGE}` elsewhere, "
-        "unzip the file, and name its folder with --on kinetix/levels."
+        f"Cannot fetch the handmade levels ({'; '.join(reasons)}): run `pip download --no-deps {PACKAGE}` on another "
+        "machine, unzip the file, and name its folder with --on kinetix/levels."
     )
 
 

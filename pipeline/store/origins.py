@@ -98,5 +98,5 @@ def require_same_levels(split: Path, origins: Mapping[int, Origin], done: Collec
         if row["content_hash"] != here.content_hash:
             raise UserError(
                 f"The levels of {here.file} and {row['file']} happen to have the same id, {row['level_id']}: "
-                "label one of them elsewhere, with out=NAME."
+                "label one of them in another folder, with out=NAME."
             )

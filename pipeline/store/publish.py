@@ -117,7 +117,7 @@ def _barred(fragment: Path) -> bool:
 
 
 class _Committed(NamedTuple):
-    """Content of a fragment's path."""
+    """Level ids and version of the object at a fragment's path."""
 
     ids: frozenset[int]  # empty for a fence or a missing file
     version: Version | None

@@ -149,7 +149,7 @@ class Evidence:
                 put(lane, arrays_of(level_at(origin_of(self.recipe.split, row)), "level/"))
             except Failure as failure:
                 reason = str(failure)[:-1]
-                self._report([True], lambda _, reason=reason: f"cannot be made again: {reason}", lane)
+                self._report([True], lambda _, reason=reason: f"cannot be rebuilt: {reason}", lane)
         return levels
 
     def _check_identities(self, levels: Level) -> Mask:

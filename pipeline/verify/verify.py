@@ -192,7 +192,7 @@ def _recipe(split: Path, fragment: Fragment, findings: Findings) -> Recipe:
     findings.config = config = fragment.config
     with recorded_settings(split):
         if config["sampler_version"] not in ALIKE_VERSIONS:  # others are compared by signature
-            raise ConfigError(f"sampler version {config['sampler_version']}, here it is {SAMPLER_VERSION}")
+            raise ConfigError(f"sampler version {config['sampler_version']}, but this levelproof has {SAMPLER_VERSION}")
         size_of(config["size"])
         rules = typed(TaskParams, config["task"], "task")
         distribution = None if from_files(config) else typed(Distribution, config["distribution"], "distribution")
@@ -268,7 +268,7 @@ def _note_losses(rows: pa.Table, recipe: Recipe, findings: Findings) -> None:
     for row, same in zip(rows.to_pylist(), same_stack(rows), strict=True):
         level_id = row["level_id"]
         if not same:
-            findings.unrepairable[level_id] = f"it was made on another stack, of {row['device']}"
+            findings.unrepairable[level_id] = f"it was made with other versions or on another device ({row['device']})"
         if recipe.distribution is None:
             findings.origins[level_id] = origin_of(recipe.split, row | {"shard": None})
             try:

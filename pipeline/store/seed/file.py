@@ -77,8 +77,8 @@ def read_seed(
             version = metadata.get(SEED_KEY, b"?").decode()
             if version != SEED_VERSION:
                 raise Failure(
-                    f"The file {path} is no seed file that this program reads (its version is {version[:9]!r}, not "
-                    f"{SEED_VERSION}): `levelproof export SPLIT --format seed` writes some."
+                    f"The file {path} is not a seed file that this program reads (its version is {version[:9]!r}, not "
+                    f"{SEED_VERSION}): `levelproof export SPLIT --format seed` writes one."
                 )
             config, config_hash = settings_in(metadata[CONFIG_KEY], metadata[HASH_KEY].decode())
             budget, content = metadata[BUDGET_KEY].decode(), json.loads(metadata[CONTENT_KEY])
@@ -137,4 +137,4 @@ def _check_lengths(column: pa.ChunkedArray, most: int) -> None:
     for chunk in column.chunks:
         offsets = np.frombuffer(chunk.buffers()[1], np.int32)[chunk.offset : chunk.offset + len(chunk) + 1]
         if (np.diff(offsets) > most).any():
-            raise ValueError("it has a witness longer than any")
+            raise ValueError(f"it has a witness larger than {most} bytes")

@@ -24,7 +24,7 @@ from levelproof.pipeline.store.seed.columns import KEPT
 from levelproof.pipeline.store.seed.file import SeedFile, damaged_seed, read_seed, seed_files
 from levelproof.pipeline.store.seed.source import LevelSource
 
-# Columns of the manifest, and those of the file that they are made from; `level_id` is always read
+# Manifest column -> columns of the seed file that it is derived from, besides `level_id`, which is always read
 IDENTITIES = ("content_hash", "signature")
 MADE_FROM: dict[str, tuple[str, ...]] = {
     **{name: (name,) for name in KEPT},
@@ -109,7 +109,7 @@ def _as(column: Any, wanted: pa.DataType) -> Any:
 
 
 def reason_of(label: str, source: str | None, steps: int | None) -> str | None:
-    """Return the reason for a label that follows from the other columns; None: it does not."""
+    """Derive the reason for a label from the other columns; None: it does not follow from them."""
     if label == Label.TRIVIAL and steps:
         return trivial_reason(steps)
     if label == Label.SOLVED and steps and source not in (None, Source.IMPORT):
@@ -124,14 +124,16 @@ def _reasons(rows: pa.Table) -> pa.Array:
     keys = np.stack([label[0], source[0], np.where(kept[0] >= 0, 0, steps), kept[0]], 1)
     found, index = np.unique(keys, axis=0, return_inverse=True)
     text = [
-        kept[1][k] if k >= 0 else reason_of(label[1][a], source[1][b] if b >= 0 else None, n) or "its file does not say"
+        kept[1][k]
+        if k >= 0
+        else reason_of(label[1][a], source[1][b] if b >= 0 else None, n) or "the seed file has no reason"
         for a, b, n, k in found.tolist()
     ]
     return pa.DictionaryArray.from_arrays(pa.array(index.reshape(-1), pa.int32()), pa.array(text, pa.string()))
 
 
 def _codes(column: pa.ChunkedArray) -> tuple[np.ndarray, list[str]]:
-    """Return the codes of a string column, -1 for null, and what they stand for."""
+    """Return the codes of a string column, -1 for null, and the string of each code."""
     array = column.unify_dictionaries().combine_chunks()
     return array.indices.fill_null(-1).to_numpy(zero_copy_only=False), array.dictionary.to_pylist()
 

@@ -46,7 +46,7 @@ class SeedShard(Shard):
         self._source = LevelSource.of(config, path)
         self.size = self._source.size
         if size not in (None, name_of(self.size)):
-            raise Failure(f"The levels of {path} have size {name_of(self.size)}, and {size} was expected.")
+            raise Failure(f"The levels of {path} have size {name_of(self.size)}, but {size} was expected.")
         engine = config.get("engine_version", FIRST_VERSION)
         self.encoding = Encoding("witness", rules=self._source.rules, engine_version=engine)
         self.level_ids: Any = rows.column("level_id").to_numpy()

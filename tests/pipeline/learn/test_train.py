@@ -125,7 +125,7 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(sealed, "SEALED", range(first, first + 2))
     with pytest.raises(levelproof.UserError, match="sealed to measure policies"):
         levels_for(TrainConfig(levels=str(split), where=""), print)
-    with pytest.raises(levelproof.UserError, match="no level but copies of sealed ones"):
+    with pytest.raises(levelproof.UserError, match="only copies of sealed levels"):
         levels_for(TrainConfig(levels=str(tmp_path)), print)  # their content, whatever their ids
 
 

@@ -137,7 +137,7 @@ def test_content_of_other_lengths_is_refused(good: Path, tmp_path: Path) -> None
         with_setting("distribution", "files")(columns, about)
         columns["content"] = [b"short"] * len(columns["level_id"])
 
-    assert "its content is not that of levels of size s" in refused(rewrite(good, tmp_path / "x.parquet", change))
+    assert "it does not contain levels of size s" in refused(rewrite(good, tmp_path / "x.parquet", change))
 
 
 def test_compressed_bombs_are_refused_before_they_are_unpacked(good: Path, tmp_path: Path) -> None:
