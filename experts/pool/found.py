@@ -30,10 +30,10 @@ def nothing_found(count: int) -> SearchFindings:
     return SearchFindings(no_success(count), [Source.EXPLORATION] * count, zeros, zeros.copy(), zeros.astype(bool))
 
 
-def row_of(found: SearchFindings, index: int) -> SearchFindings:
+def row_of(findings: SearchFindings, index: int) -> SearchFindings:
     """Select one level."""
-    arrays = jax.tree.map(lambda x: x[index : index + 1], found._replace(source=()))
-    return arrays._replace(source=[found.source[index]])
+    arrays = jax.tree.map(lambda x: x[index : index + 1], findings._replace(source=()))
+    return arrays._replace(source=[findings.source[index]])
 
 
 def joined(parts: Sequence[SearchFindings], order: Int[np.ndarray, " level"]) -> SearchFindings:

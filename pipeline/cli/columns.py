@@ -45,17 +45,17 @@ def run(arguments: argparse.Namespace) -> None:
     from levelproof.pipeline.store.columns import DESCRIBED
 
     text = lambda column: f"{column.name} {column.type_name} {column.unit} {column.meaning}".lower()
-    found = [column for column in DESCRIBED if arguments.word.lower() in text(column)]
-    if not found:
+    matching = [column for column in DESCRIBED if arguments.word.lower() in text(column)]
+    if not matching:
         raise UserError(
             f"No column contains the word {arguments.word!r}: levelproof columns, without a word, lists all."
         )
     if arguments.json:
-        print(json.dumps([column._asdict() | {"type": column.type_name} for column in found], indent=2))
+        print(json.dumps([column._asdict() | {"type": column.type_name} for column in matching], indent=2))
     elif arguments.markdown:
         print(as_markdown(), end="")
     else:
-        print(*listed(map(_entry, found), shutil.get_terminal_size().columns, INDENT), sep="\n")
+        print(*listed(map(_entry, matching), shutil.get_terminal_size().columns, INDENT), sep="\n")
 
 
 def _entry(column: "ManifestColumn") -> tuple[str, str]:

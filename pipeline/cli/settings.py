@@ -37,17 +37,19 @@ def run(arguments: argparse.Namespace) -> None:
     from levelproof.configs.meanings import every_setting
 
     has_word = lambda text: arguments.word.lower() in text.lower()
-    found = [setting for setting in every_setting() if has_word(f"{setting.override} {setting.text} {setting.group}")]
-    if not found:
+    matching = [
+        setting for setting in every_setting() if has_word(f"{setting.override} {setting.text} {setting.group}")
+    ]
+    if not matching:
         raise UserError(
             f"No setting contains the word {arguments.word!r}: levelproof settings, without a word, lists all."
         )
     if arguments.json:
-        print(json.dumps([asdict(setting) for setting in found], indent=2))
+        print(json.dumps([asdict(setting) for setting in matching], indent=2))
     elif arguments.markdown:
-        print(as_markdown(found), end="")
+        print(as_markdown(matching), end="")
     else:
-        print(as_text(found, shutil.get_terminal_size().columns))
+        print(as_text(matching, shutil.get_terminal_size().columns))
 
 
 def as_text(settings: Iterable["Setting"], columns: int) -> str:

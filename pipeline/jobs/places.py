@@ -26,7 +26,7 @@ def workers_by_machine(machines: Mapping[str, Machine], kind: str, most: int, me
     Each worker has its own core or GPU (`kind`, "CPU" or "GPU") and `memory` bytes. A machine with too little memory
     for one worker still gets one.
     """
-    count = {name: min(_units(of, kind), max(1, _fit(of, memory))) for name, of in machines.items()}
+    count = {name: min(_units(machine, kind), max(1, _fit(machine, memory))) for name, machine in machines.items()}
     turns = sorted((turn, name) for name, number in count.items() for turn in range(number))  # one on each, then more
     return Counter(name for _, name in turns[:most])
 

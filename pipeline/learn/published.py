@@ -89,11 +89,11 @@ def handmade_folder(say: Callable[[str], None] = print) -> Path:
     folder.parent.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent) as temporary:
         _fetch(Path(temporary))
-        found = Path(temporary) / "kinetix" / "levels"
-        if not _is_whole(found):
+        unpacked = Path(temporary) / "kinetix" / "levels"
+        if not _is_whole(unpacked):
             raise Failure(f"The package {PACKAGE} does not have the handmade levels that it should have.")
         shutil.rmtree(folder, ignore_errors=True)
-        found.rename(folder)
+        unpacked.rename(folder)
     return folder
 
 

@@ -62,8 +62,8 @@ def altered(path: Path, digests: Mapping[str, str], name: str) -> list[str]:
         OSError: a file cannot be read.
     """
     files = [file for file in digests if file.rpartition("/")[2] == name and _is_below(file)]
-    found = at_once(path, lambda file: _digest(path / file), files)
-    return [file for file, digest in zip(files, found, strict=True) if digest != digests[file]]
+    actual = at_once(path, lambda file: _digest(path / file), files)
+    return [file for file, digest in zip(files, actual, strict=True) if digest != digests[file]]
 
 
 def _digest(path: Path) -> str:

@@ -147,8 +147,8 @@ class Manifest:
 
     def counts(self, mask: np.ndarray) -> dict[str, int]:
         """Count the labels of the rows in `mask`, the most frequent first."""
-        found = self.table.column("label").filter(mask).value_counts().to_pylist()
-        return {entry["values"]: entry["counts"] for entry in sorted(found, key=lambda entry: -entry["counts"])}
+        counted = self.table.column("label").filter(mask).value_counts().to_pylist()
+        return {entry["values"]: entry["counts"] for entry in sorted(counted, key=lambda entry: -entry["counts"])}
 
     @property
     def shards(self) -> frozenset[str]:
@@ -224,15 +224,15 @@ def _parts(
     A seal removes fragments once a sealed one has their levels, so a level may move between two fragments unseen. This
     lists the folder again until a listing finds no new sealed fragment, and no listed one that is missing when read.
     """
-    found: dict[tuple[Path, int], tuple[Fragment, pa.Table]] = {}
+    parts_read: dict[tuple[Path, int], tuple[Fragment, pa.Table]] = {}
     with ThreadPoolExecutor(THREADS) as threads:
         for listing in range(MAX_LISTINGS):
             listed = entries(split, MANIFEST, FRAGMENT, DirEntry.is_file).items()
-            new = [entry for entry in listed if entry not in found and _wanted(entry[0], level_ids)]
+            new = [entry for entry in listed if entry not in parts_read and _wanted(entry[0], level_ids)]
             parts = list(with_bar(threads.map(read, (path for path, _ in new)), "fragments", len(new), MANY))
-            found |= {entry: part for entry, part in zip(new, parts, strict=True) if part}
+            parts_read |= {entry: part for entry, part in zip(new, parts, strict=True) if part}
             if listing and all(part and not part[0].sealed for part in parts):
-                latest = {path: part for (path, _), part in found.items()}  # a path's file may have been replaced
+                latest = {path: part for (path, _), part in parts_read.items()}  # a path's file may have been replaced
                 return [latest[path] for path in sorted(latest) if latest[path][0].rows]  # those without rows: fences
     raise Failure(f"The fragments of {split} change faster than they can be read: try again after the writer ends.")
 
@@ -331,7 +331,7 @@ def _nothing_at(split: Path) -> str:
     """Say in a sentence why a folder is not a split."""
     require_known(split)
     here = [] if is_remote(split) else [f"{above}{MANIFEST}" for above in ("*/", "*/*/", "*/*/*/")]
-    below = [found.parent for pattern in here for found in split.glob(pattern)]
+    below = [path.parent for pattern in here for path in split.glob(pattern)]
     if below:
         names = ", ".join(map(str, sorted(below)[:MAX_SHOWN]))
         return f"{split} is not a split, but a folder of {len(below)}: name one of them, such as {names}."

@@ -55,10 +55,10 @@ def get(path: Path, most: float = inf) -> StoredFile:
         response = obstore_module().get(store, key)
         return StoredFile(data_of(response, most), Version.of(response.meta))
 
-    found = ask(path, request)
-    if len(found.data) > most:
+    file = ask(path, request)
+    if len(file.data) > most:
         raise OSError(f"{as_typed(path)} is larger than {most} bytes")
-    return found
+    return file
 
 
 def begin_of(path: Path, most: int) -> tuple[bytes, int]:

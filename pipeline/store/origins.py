@@ -37,10 +37,10 @@ class RecordPlace(NamedTuple):
 
 def place_of(file: str) -> RecordPlace | None:
     """Return the record that a row's `file` names; None: it names a level file."""
-    found = RECORD.fullmatch(file)
-    if not found or not os.path.isdir(f"{found[1]}/{found[2]}") or os.path.exists(file):  # `file` may be any string
+    match = RECORD.fullmatch(file)
+    if not match or not os.path.isdir(f"{match[1]}/{match[2]}") or os.path.exists(file):  # `file` may be any string
         return None
-    return RecordPlace(Path(found[1]), found[2], int(found[3]))
+    return RecordPlace(Path(match[1]), match[2], int(match[3]))
 
 
 class Origin(NamedTuple):
@@ -57,10 +57,10 @@ class Origin(NamedTuple):
 
 def origin_of(split: Path, row: Mapping[str, Any]) -> Origin:
     """Return the origin of a manifest row that has the columns ASKED."""
-    found = Origin(row["content_hash"], row["file"] or "", row["size"], as_typed(absolute(split)))
+    origin = Origin(row["content_hash"], row["file"] or "", row["size"], as_typed(absolute(split)))
     if not row["shard"]:
-        return found
-    return found._replace(shard=row["shard"], row=row["row"], level_id=row["level_id"])
+        return origin
+    return origin._replace(shard=row["shard"], row=row["row"], level_id=row["level_id"])
 
 
 def origins_of(split: Path, level_ids: Collection[int]) -> dict[int, Origin]:

@@ -84,17 +84,17 @@ class PieceCache:
 
     def _make_room(self) -> None:
         """Remove the least recently used pieces, and what killed processes left half-written."""
-        found, now = [], time.time()
+        pieces, now = [], time.time()
         with os.scandir(self.folder) as entries:
             for entry in entries:
                 with suppress(FileNotFoundError):
                     about = entry.stat(follow_symlinks=False)
                     if not entry.name.startswith(".") or now - about.st_mtime > ABANDONED:
-                        found.append((about.st_mtime, about.st_size, entry.path))
-        total = sum(size for _, size, _ in found)
+                        pieces.append((about.st_mtime, about.st_size, entry.path))
+        total = sum(size for _, size, _ in pieces)
         if total <= self.most:
             return
-        for _, size, path in sorted(found):
+        for _, size, path in sorted(pieces):
             if total <= KEPT_SHARE * self.most:
                 break
             with suppress(FileNotFoundError):

@@ -74,8 +74,8 @@ def _made(parent: Path, prefix: str) -> tuple[Path, int]:
 
 @cache
 def _sweep_once(parent: Path, prefix: str) -> None:
-    with suppress(OSError), os.scandir(parent) as found:  # a folder that cannot be listed is not swept
-        for entry in found:
+    with suppress(OSError), os.scandir(parent) as entries:  # a folder that cannot be listed is not swept
+        for entry in entries:
             if entry.name.startswith(prefix) and entry.is_dir(follow_symlinks=False):
                 with suppress(OSError):  # other processes sweep, too
                     _sweep(Path(entry.path))

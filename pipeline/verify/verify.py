@@ -256,10 +256,10 @@ def _opened(name: str, recipe: Recipe, level_ids: set[int], findings: Findings) 
 def _changed_files(split: Path, name: str, digests: Mapping[str, str]) -> list[str]:
     """List the files of a shard or of experts that are changed, missing or new."""
     try:
-        found = digests_of(data_path(split, name), digests)
+        current = digests_of(data_path(split, name), digests)
     except (Failure, OSError):
-        found = {}
-    return sorted(file for file in {**found, **digests} if found.get(file) != digests.get(file))
+        current = {}
+    return sorted(file for file in {**current, **digests} if current.get(file) != digests.get(file))
 
 
 def _note_losses(rows: pa.Table, recipe: Recipe, findings: Findings) -> None:

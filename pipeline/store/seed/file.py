@@ -107,8 +107,10 @@ def damaged_seed(path: Path, error: Exception) -> Failure:
     return Failure(f"The seed file {path} is damaged ({reason}): " + mended(path, "copy it again from its source."))
 
 
-def _are_digests(found: Any) -> bool:
-    return isinstance(found, list) and all(isinstance(one, str) and re.fullmatch("[0-9a-f]{64}", one) for one in found)
+def _are_digests(digests: Any) -> bool:
+    return isinstance(digests, list) and all(
+        isinstance(one, str) and re.fullmatch("[0-9a-f]{64}", one) for one in digests
+    )
 
 
 def _check(table: pa.Table) -> None:

@@ -122,12 +122,12 @@ def _reasons(rows: pa.Table) -> pa.Array:
     steps = rows.column("steps_to_goal").fill_null(0).to_numpy()
     kept = _codes(rows.column("label_reason"))
     keys = np.stack([label[0], source[0], np.where(kept[0] >= 0, 0, steps), kept[0]], 1)
-    found, index = np.unique(keys, axis=0, return_inverse=True)
+    distinct, index = np.unique(keys, axis=0, return_inverse=True)
     text = [
         kept[1][k]
         if k >= 0
         else reason_of(label[1][a], source[1][b] if b >= 0 else None, n) or "the seed file has no reason"
-        for a, b, n, k in found.tolist()
+        for a, b, n, k in distinct.tolist()
     ]
     return pa.DictionaryArray.from_arrays(pa.array(index.reshape(-1), pa.int32()), pa.array(text, pa.string()))
 
@@ -157,9 +157,9 @@ def _made_with(rows: pa.Table, name: str) -> pa.Array:
 
 @cache
 def _parsed(text: str) -> Mapping[str, Any]:
-    found = json.loads(text)
-    pa.array([found["versions"]], COLUMNS.field("versions").type)
-    return found
+    content = json.loads(text)
+    pa.array([content["versions"]], COLUMNS.field("versions").type)
+    return content
 
 
 def _commands(about: SeedFile, rows: pa.Table) -> pa.Array:
@@ -180,10 +180,10 @@ def _commands(about: SeedFile, rows: pa.Table) -> pa.Array:
 def _identities(about: SeedFile, rows: pa.Table) -> dict[str, pa.Array]:
     """Hash the levels of rows, which takes about a tenth of a millisecond for each."""
     source = LevelSource.of(about.fragment.config, about.fragment.path)
-    found: dict[str, list[Any]] = {name: [] for name in IDENTITIES}
+    identities: dict[str, list[Any]] = {name: [] for name in IDENTITIES}
     for first in range(0, rows.num_rows, CHUNK):
         some = rows.slice(first, CHUNK)
         levels = source.levels(some.column("level_id").to_numpy(), some.column("content").to_pylist())
-        found["content_hash"] += content_hashes(levels)
-        found["signature"] += signatures(levels)
-    return {name: pa.array(values, COLUMNS.field(name).type) for name, values in found.items()}
+        identities["content_hash"] += content_hashes(levels)
+        identities["signature"] += signatures(levels)
+    return {name: pa.array(values, COLUMNS.field(name).type) for name, values in identities.items()}

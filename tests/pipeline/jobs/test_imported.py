@@ -187,11 +187,11 @@ def test_import_reports_and_skips_invalid_records(once: Path, tmp_path: Path) ->
     assert done.returncode == 0, done.stderr
     assert f"{ROWS - 4} levels of" in done.stdout
     assert "4 were left out." in done.stdout
-    said = [line for line in done.stderr.splitlines() if line.startswith("Left out:")]
-    assert len(said) == module.REPORTED
-    assert "odd/array#1, its actions are not actions of this task." in said[0]
-    assert "#2, its polygon/position has a value that is not a finite 32-bit number." in said[1]
-    assert "#3, its model/joint_a has values out of range for this size." in said[2]
+    messages = [line for line in done.stderr.splitlines() if line.startswith("Left out:")]
+    assert len(messages) == module.REPORTED
+    assert "odd/array#1, its actions are not actions of this task." in messages[0]
+    assert "#2, its polygon/position has a value that is not a finite 32-bit number." in messages[1]
+    assert "#3, its model/joint_a has values out of range for this size." in messages[2]
     assert [row["level_id"] for row in rows_of(tmp_path / "data/1M/s")] == [0, 5, 6]
     assert read_status(tmp_path / "data/1M/s")["wanted"] == ROWS - 4
     want = [rows_of(once / "data/1M/s")[i]["content_hash"] for i in (0, 5, 6)]

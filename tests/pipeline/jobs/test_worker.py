@@ -124,7 +124,7 @@ def test_other_worker_makes_returned_and_undecided_levels_to_the_same_bits(tmp_p
     assert kept
     assert back
     assert sorted([*kept.level_ids, *back.level_ids]) == list(unit.level_ids)
-    while sum(of[1] for of in round.totals.values()) < len(kept.level_ids) - 1:
+    while sum(progress[1] for progress in round.totals.values()) < len(kept.level_ids) - 1:
         round = worker.work(Order([]), 0.01)
     worker.stopping = True
     round = worker.work(Order([]), 60.0)
@@ -168,7 +168,7 @@ def test_worker_resumes_experts_that_another_saved(tmp_path: Path, job: JobConfi
     round = worker.work(Order([]), 60.0)
     (path,) = (tmp_path / "kept/checkpoints").iterdir()
     kept = load_paused(tmp_path / "kept", unit.level_ids, job)
-    steps = sum(int(of.expert.begun.training.progress.env_steps) for of in kept.values())
+    steps = sum(int(paused.expert.begun.training.progress.env_steps) for paused in kept.values())
     assert steps
     assert load_paused(tmp_path / "kept", unit.level_ids, replace(job, budget="8k")) == {}
     rest = round.cuts[-1].back
@@ -221,7 +221,7 @@ def test_failing_step_fails_running_units_but_no_later_one(
     monkeypatch.setattr(pool_module, "advance", failing(advance, MemoryError("no room on the device"), after=2))
     found = outcomes(worker, UNITS)
     assert found.keys() == set(UNITS)
-    assert all(of.reason.endswith("MemoryError: no room on the device\n") for of in found.values())
+    assert all(outcome.reason.endswith("MemoryError: no room on the device\n") for outcome in found.values())
     assert not list(tmp_path.rglob("*.parquet"))
     monkeypatch.setattr(pool_module, "advance", advance)
     assert outcomes(worker, UNITS[1:2])[UNITS[1]].summary

@@ -32,14 +32,14 @@ from levelproof.pipeline.store.manifest import read_fragment
 peak = lambda: 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 good, *others = map(Path, sys.argv[1:])
 read_fragment(good)
-before, said = peak(), []
+before, reasons = peak(), []
 for path in others:
     try:
         read_fragment(path)
-        said.append("")
+        reasons.append("")
     except Failure as failure:
-        said.append(str(failure.__cause__))
-print(json.dumps([peak() - before, said]))
+        reasons.append(str(failure.__cause__))
+print(json.dumps([peak() - before, reasons]))
 """
 
 
@@ -161,8 +161,8 @@ def test_read_fragment_refuses_bombs_before_decompressing_them(good: Path, tmp_p
         text=True,
         check=True,
     )
-    grown, said = json.loads(done.stdout)
-    assert said == [*HOSTILE.values()]
+    grown, reasons = json.loads(done.stdout)
+    assert reasons == [*HOSTILE.values()]
     assert grown < MOST
 
 

@@ -191,6 +191,6 @@ def test_commands_end_in_one_sentence(good: Path, tmp_path: Path, capsys: pytest
     path = rewrite(good, tmp_path / "levels.parquet", CHANGES["made with a nest"])
     for words in (["inspect", str(path)], ["verify", str(path)], ["grow", str(path), "-o", str(tmp_path / "128k/s")]):
         assert main(words) != 0
-        said = capsys.readouterr()
-        assert "Traceback" not in said.err
-        assert "The seed file" in said.out + said.err
+        captured = capsys.readouterr()
+        assert "Traceback" not in captured.err
+        assert "The seed file" in captured.out + captured.err

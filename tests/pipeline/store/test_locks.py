@@ -105,18 +105,18 @@ def test_locks_exclude_on_nfs_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert not is_written(tmp_path)
     with only_writer(tmp_path, print):
         pass
-    said: list[str] = []
+    messages: list[str] = []
     with held_elsewhere("committing", tmp_path) as worker:
 
         def then_end_it(text: str) -> None:
-            said.append(text)
+            messages.append(text)
             worker.communicate()
 
         with committing(tmp_path):
             pass
         with without_commits(tmp_path, then_end_it):
             assert worker.returncode == 0
-    assert len(said) == 1
+    assert len(messages) == 1
 
 
 @pytest.mark.parametrize("refused", [fcntl.LOCK_SH, fcntl.LOCK_EX])

@@ -85,9 +85,9 @@ def test_seal_preserves_rows_and_bits(split: Path, made: Path, rows: int, fragme
     assert_tidy(split, fragments)
     assert all(fragment.sealed for fragment in read_manifest(split).fragments)
     assert plan(pieces(split), rows) == []
-    said: list[str] = []
-    clean(split, said.append)
-    assert not said
+    messages: list[str] = []
+    clean(split, messages.append)
+    assert not messages
     assert_tidy(split, fragments)
 
 
