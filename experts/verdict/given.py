@@ -1,4 +1,4 @@
-"""Imported actions: replay them here, and label their levels by the result."""
+"""Imported actions: replay them in this engine, and label their levels by the result."""
 
 import jax
 import numpy as np

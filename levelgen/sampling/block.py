@@ -43,7 +43,7 @@ GOAL_BODIES = 2  # green and blue come first
 
 
 class Filling(IntEnum):
-    """What to add at a body's turn after green, blue and the third body."""
+    """What to add at each turn after the first three bodies (green, blue and another)."""
 
     CONNECTED = 0
     FREE = 1

@@ -74,7 +74,7 @@ class WorkerHandle:
 
     @property
     def free(self) -> bool:
-        """Whether it can take an order now."""
+        """Whether the worker can take an order now."""
         return self.up and self.answer is None
 
     def start(self, name: str, gpus: int, *begin: Any) -> None:
@@ -126,7 +126,7 @@ class Crew:
     """All workers of a job: one for each core or GPU of each machine."""
 
     def __init__(self, job: JobConfig, split: Path, scheduler: Scheduler, board: Board, writer: str = "") -> None:
-        """`writer` names the split's writer, for whom workers commit (see `leases.serve`); empty: there is none."""
+        """Plan the workers; `writer` names the writer for which they commit (see `leases.serve`), or is empty."""
         if why := _why_no_gpu() if job.device == "gpu" else "":
             board.say(f"Workers use CPU cores, not GPUs: {why}.")
         self._gpus = job.device == "gpu" and not why

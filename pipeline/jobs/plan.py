@@ -57,7 +57,7 @@ def plan(job: JobConfig, as_json: bool, console: Console) -> None:
 
 
 def report_lines(job: JobConfig, sample: Sample, cost: Forecast) -> list[str]:
-    """Return the forecast as lines for people."""
+    """Return the forecast as lines for the terminal."""
     scale, unit = next((one for one in UNITS if cost.wall.expected > 1.5 * one[0]), UNITS[-1])
     per_solved = cost.seconds_per_solved
     lines = {

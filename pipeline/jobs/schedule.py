@@ -342,5 +342,5 @@ def schedule(
 
 
 def levels_text(units: Iterable[WorkUnit]) -> str:
-    """Describe the levels of units for people: `levels 0 to 31, 96 to 127`."""
+    """Describe the levels of units for messages: `levels 0 to 31, 96 to 127`."""
     return runs_text(runs([level_id for unit in units for level_id in unit.level_ids]))

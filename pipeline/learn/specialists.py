@@ -19,7 +19,7 @@ ATTEMPTS = 16  # by which splits rate an expert if their configuration does not 
 class Specialists(NamedTuple):
     """The experts of a split."""
 
-    name: str  # for people
+    name: str  # as shown to users
     solved: Solved  # first episodes with sampled actions; an expert that was not needed or found nothing has none
 
 

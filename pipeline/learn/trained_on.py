@@ -23,7 +23,7 @@ from levelproof.pipeline.words import many
 class TrainingLevels(NamedTuple):
     """Levels of one size."""
 
-    name: str  # for people
+    name: str  # as shown to users
     levels: Level | Sampler
     rules: TaskParams
     facts: dict[str, Any]  # what identifies them, as JSON

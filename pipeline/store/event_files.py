@@ -1,6 +1,6 @@
 """Events of runs, as JSON lines in one small file per run below the split's `events/`.
 
-They are for people who watch a run: no commit and no reader of a split depends on them, so they may be deleted.
+They are for users who watch a run: no commit and no reader of a split depends on them, so they may be deleted.
 """
 
 import json

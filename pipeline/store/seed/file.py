@@ -45,12 +45,12 @@ class SeedFile:
 
 
 def is_seed(path: Path) -> bool:
-    """Whether a path names a seed file or a folder of some, and not a split with shards."""
+    """Whether a path names a seed file or a folder of them, not a split with shards."""
     return bool(seed_files(path))
 
 
 def seed_files(path: Path) -> list[Path]:
-    """List the seed files at a path, by name; none if it is something else."""
+    """List the seed files at a path, by name; none if it is neither a seed file nor a folder of them."""
     if is_remote(path) or not path.is_dir():
         return [path] if path.suffix == SUFFIX and (is_remote(path) or path.is_file()) else []
     if (path / MANIFEST).exists():

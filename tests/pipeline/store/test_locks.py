@@ -42,7 +42,7 @@ def test_committing_is_shared(tmp_path: Path) -> None:
 
 
 def test_committing_refuses_workers_of_an_earlier_writer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not even to a folder that was deleted and created again."""
+    """A folder that was deleted and created again does not let them commit, either."""
     monkeypatch.setattr(leases, "_served", {})
     worker = Path(os.path.relpath(tmp_path))  # another process may know it by this path
     with only_writer(tmp_path, print):
