@@ -20,7 +20,7 @@ class SearchFindings(NamedTuple):
     success: Success
     source: list[Source]  # of the success, or of the one that training may find
     search_steps: Int[np.ndarray, " level"]  # 0: not searched
-    cells: Int[np.ndarray, " level"]  # that the search reached
+    cells: Int[np.ndarray, " level"]  # cells that the search reached
     still_grew: Bool[np.ndarray, " level"]  # whether the archive was growing when the search ended
 
 

@@ -44,9 +44,7 @@ class SearchConfig:
     )  # probability of resampling an entry of the action, per env step
     segment: int = 8  # env steps between visits to the archive
     stretch: int = 4  # segments that a lane plays before it returns to an archived state
-    anew: float = (
-        0.5  # share of returns that start with a new random action; the others repeat the archived state's last
-    )
+    anew: float = 0.5  # share of returns that start with a new random action; others repeat the archived state's last
     # archive
     entries: int = 512  # archived states per level
     nearer: float = 0.5  # share of returns that draw two states and pick the one nearer to the goal

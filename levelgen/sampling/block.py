@@ -104,8 +104,8 @@ class Workspace(NamedTuple):
     draft: Draft
     order: NewOrder
     numbers: Float[Ref, "number lane"]  # all random numbers of a level, by `Layout`
-    chosen: Float[Ref, "draw lane"]  # those of the proposal with the fewest contacts so far
-    contacts: Float[Ref, " lane"]  # of that proposal
+    chosen: Float[Ref, "draw lane"]  # random numbers of the proposal with the fewest contacts so far
+    contacts: Float[Ref, " lane"]  # contacts of that proposal
 
 
 def scratch_of(size: Size, layout: Layout) -> Workspace:

@@ -151,7 +151,7 @@ class Assignment:
     spare: int = 0  # unstarted levels
     asked: int = 0  # levels to give back
     heard: float = 0.0  # s, time of the last order or report
-    slowness: float | None = None  # its time per level divided by other workers'; None: it has ended no unit
+    slowness: float | None = None  # the worker's time per level, divided by other workers'; None: it has ended no unit
 
 
 class Scheduler:

@@ -88,7 +88,7 @@ def write_fragment(
         file.write(with_own(whole.getvalue().to_pybytes()))
     flush_entry(attempt.begun)
     attempt.begun.replace(attempt.fragment)
-    flush_entry(attempt.fragment.parent)  # its new name
+    flush_entry(attempt.fragment.parent)  # makes the fragment's name durable
 
 
 def settings_metadata(config_hash: str, config: Mapping[str, Any]) -> dict[bytes, bytes]:
@@ -233,7 +233,7 @@ def _parts(
             parts_read |= {entry: part for entry, part in zip(new, parts, strict=True) if part}
             if listing and all(part and not part[0].sealed for part in parts):
                 latest = {path: part for (path, _), part in parts_read.items()}  # a path's file may have been replaced
-                return [latest[path] for path in sorted(latest) if latest[path][0].rows]  # those without rows: fences
+                return [latest[path] for path in sorted(latest) if latest[path][0].rows]  # fences have no rows
     raise Failure(f"The fragments of {split} change faster than they can be read: try again after the writer ends.")
 
 

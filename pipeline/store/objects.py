@@ -133,7 +133,7 @@ def require_conditions(probe: Path) -> None:
     except (NotImplementedError, obstore_module().exceptions.NotSupportedError):
         supported = False
     except StoreFailure as failure:
-        if "(501" not in str(failure):  # with its bracket, because the URL may contain any number
+        if "(501" not in str(failure):  # with the bracket, because the URL may contain any number
             raise
         supported = False
     if not supported:

@@ -228,7 +228,7 @@ class RemoteFile:
             return answer.meta, data_of(answer, last - first)
 
         about, data = ask(self.path, request)
-        tag = self._about.tag if self.path.parts[0] in HUB else _tag(about)  # its file servers use other tags
+        tag = self._about.tag if self.path.parts[0] in HUB else _tag(about)  # the hub's file servers use other tags
         if (tag, about["size"], len(data)) != (*self._about, last - first):
             _known.pop(_folder_of(self.path), None)
             raise OSError(f"{as_typed(self.path)} has changed")

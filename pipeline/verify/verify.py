@@ -191,7 +191,7 @@ def _recipe(split: Path, fragment: Fragment, findings: Findings) -> Recipe:
     """Return how to make and play the levels. Raise Failure if this version cannot."""
     findings.config = config = fragment.config
     with recorded_settings(split):
-        if config["sampler_version"] not in ALIKE_VERSIONS:  # others are compared by signature
+        if config["sampler_version"] not in ALIKE_VERSIONS:  # levels of alike versions are compared by signature
             raise ConfigError(f"sampler version {config['sampler_version']}, but this levelproof has {SAMPLER_VERSION}")
         size_of(config["size"])
         rules = typed(TaskParams, config["task"], "task")

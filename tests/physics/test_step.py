@@ -159,7 +159,7 @@ class TestInactive:
     @few
     @given(st.sampled_from([BOX, BALL, OTHER]), speeds, turns)
     def test_inactive_body_moves_nothing(self, ghost, speed, turn) -> None:
-        """Inside another body or thrown at it, an inactive body has no effect: the others move as if it were far away."""
+        """Inside another body or thrown at it, an inactive body has no effect: others move as if it were far away."""
         victim = BALL if ghost != BALL else OTHER
         model, state = room()
         model = changed(model, active={ghost: False})

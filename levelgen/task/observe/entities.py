@@ -73,7 +73,7 @@ class EntityObservation:
     thruster_mask: Bool[Array, "thruster lane"]
     attention_mask: Bool[Array, "4 body body lane"]
     joint_indexes: Int[Array, "joint_end 2 lane"]  # attending body, attended body; 0 for inactive joints
-    thruster_indexes: Int[Array, "thruster lane"]  # its body
+    thruster_indexes: Int[Array, "thruster lane"]  # the body that each thruster is on
 
 
 def entities(level: Level, state: State) -> EntityObservation:

@@ -17,8 +17,8 @@ class Operation(NamedTuple):
     words: tuple[str, ...]
     before: tuple[tuple[str, ...], ...] = ()  # commands that run first
     left: bool = False  # add what dead processes leave
-    beside: bool = False  # it seals during the job
-    works: bool = True  # it has a worker
+    beside: bool = False  # the command seals during the job
+    works: bool = True  # the command has a worker
 
 
 OPERATIONS = {

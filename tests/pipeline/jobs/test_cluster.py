@@ -363,7 +363,7 @@ def test_run_survives_machines_that_join_and_leave(tmp_path: Path, machines: Any
     assert f"The experts in {tmp_path / SPLIT / trained['experts']} cannot be read" in note.read_text()
 
     own = run(["generate", "levels=1", "budget=5k", "out=own", "executor=ray"], tmp_path)
-    assert own.returncode == 0, own.stderr  # it ignores a cluster that RAY_ADDRESS does not name
+    assert own.returncode == 0, own.stderr  # the command ignores a cluster that RAY_ADDRESS does not name
 
 
 @pytest.mark.campaign

@@ -377,7 +377,7 @@ def left_by_a_killed_writer(**other: Any) -> bytes:
 def test_lease_of_a_dead_process_is_taken_at_once_on_its_machine_only(
     server: Server, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """The lease is not taken on another machine with the same host name, which outside of containers has the same PID namespace, too."""
+    """Another machine with the same host name waits, although PID namespaces outside of containers are equal, too."""
     monkeypatch.setattr(leases, "NOTICE", 0.0)
     messages: list[str] = []
     put(THERE / WRITER_LOCK, left_by_a_killed_writer())
