@@ -98,14 +98,14 @@ class Model:
     joint_min: Float[Array, "joint lane"]  # rad
     joint_max: Float[Array, "joint lane"]
     motor_on: Bool[Array, "joint lane"]
-    motor_speed: Float[Array, "joint lane"]  # of Params.motor_speed
-    motor_power: Float[Array, "joint lane"]  # of Params.motor_power
+    motor_speed: Float[Array, "joint lane"]  # as a multiple of Params.motor_speed
+    motor_power: Float[Array, "joint lane"]  # as a multiple of Params.motor_power
     # thrusters
     thruster_active: Bool[Array, "thruster lane"]
     thruster_body: Int[Array, "thruster lane"]
     thruster_position: Float[Array, "thruster 2 lane"]  # in the frame of the body
     thruster_rotation: Float[Array, "thruster lane"]  # rad, relative to the body
-    thruster_power: Float[Array, "thruster lane"]  # of Params.thruster_power
+    thruster_power: Float[Array, "thruster lane"]  # as a multiple of Params.thruster_power
 
     @property
     def size(self) -> Size:

@@ -89,8 +89,8 @@ class SearchConfig:
         An env step costs about the square of the number of bodies.
         """
         share = min(1.0, (self.bodies / bodies) ** 2) if self.bodies else 1.0
-        less = {name: int(getattr(self, name) * share) for name in ("env_steps", "variations", "patience")}
-        return replace(self, **less)
+        reduced = {name: int(getattr(self, name) * share) for name in ("env_steps", "variations", "patience")}
+        return replace(self, **reduced)
 
     @property
     def steps_per_round(self) -> int:

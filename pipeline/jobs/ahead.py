@@ -30,7 +30,7 @@ class Ahead:
         search = job.search.scaled(size_of(job.size).bodies)
         of_code = [entry for entry in program_of(job).items() if entry[0] != "configuration"]
         settings = job.size, job.expert, search.endless, search.steady, job.task, of_code, device()
-        self._seconds: list[float] = []  # of each program that this process has compiled
+        self._seconds: list[float] = []  # time of each program that this process has compiled
         self._tracing = Lock()  # Python's part of compiling gains nothing from threads, and shares what it caches
         self._programs = {_claim(folder, program, repr(settings)): program for program in programs}
 
@@ -43,7 +43,7 @@ class Ahead:
             with suppress(OSError):  # a folder that cannot be written to, or has no locks: compile when needed
                 if not _is_done(path) and (file := try_claim(path)):
                     with file:
-                        if not _is_done(path):  # by now
+                        if not _is_done(path):  # another process may have compiled it by now
                             self._compile(program)
                             file.truncate(0)
                             file.write(DONE)

@@ -101,7 +101,7 @@ def _job(folder: Folder, out: Path) -> ImportConfig:
     """Return the job that imports a folder; raise UserError if `out` does not end in a budget and the right size."""
     size, absolute = name_of(folder.size), out.expanduser().absolute()
     parent = out.parent.parent if len(out.parts) > 1 else absolute.parent.parent
-    example = f"name the split like -o data/1M/{size}"
+    example = f"name the split by its budget and size, as in -o data/1M/{size}"
     if absolute.name != size:
         raise UserError(f"{folder.path} has levels of size {size}, but the split is named {out}: {example}.")
     try:

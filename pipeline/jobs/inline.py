@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 HERE = "this process"
 POLL = 0.25  # s between progress updates while programs compile
-MAX_THREADS = 6  # of compiling; one at a time traces, which takes a fifth of the time
+MAX_THREADS = 6  # threads that compile; one at a time traces, which takes a fifth of the time
 MANY = 16  # levels; a job of fewer may compile programs that it does not use
 
 

@@ -12,7 +12,7 @@ Machine = Mapping[str, Any]  # a machine's entry in Ray's list of nodes
 GB = 10**9  # bytes
 # Largest number of bodies, and bytes of a worker. Compiling takes the most: measured 1.35 GB for s and 1.64 for l
 BYTES = ((SIZES["s"].bodies, 1.5 * GB), (SIZES["l"].bodies, 1.8 * GB))
-MAX_BYTES = 2.5 * GB  # of a worker for larger sizes; an estimate
+MAX_BYTES = 2.5 * GB  # memory of a worker for larger sizes; an estimate
 
 
 def bytes_of_worker(size: Size) -> int:

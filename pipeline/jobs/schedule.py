@@ -117,7 +117,7 @@ Settle = Callable[[Sequence[UnitOutcome]], None]  # accounts for attempts that e
 class Cut(NamedTuple):
     """A unit from which a worker has given levels back."""
 
-    unit: WorkUnit  # before the cut
+    unit: WorkUnit  # the unit before the cut
     kept: WorkUnit | None  # continues on the worker
     back: WorkUnit | None  # returns to the scheduler
 
@@ -138,7 +138,7 @@ class Round:
 class Order:
     """The driver's instructions for a worker's next round."""
 
-    units: list[WorkUnit]  # to begin
+    units: list[WorkUnit]  # units to begin
     give: int = 0  # unstarted levels to give back
 
 
@@ -146,7 +146,7 @@ class Order:
 class Assignment:
     """The units of one worker, and what it last reported."""
 
-    units: dict[WorkUnit, None] = field(default_factory=dict)  # in the order in which it got them
+    units: dict[WorkUnit, None] = field(default_factory=dict)  # in the order in which the worker got them
     wants: int = 1  # further levels for which it has room
     spare: int = 0  # unstarted levels
     asked: int = 0  # levels to give back

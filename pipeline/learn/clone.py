@@ -75,10 +75,10 @@ def clone(splits: Sequence[Path], config: CloneConfig, out: Path, console: Conso
 
 
 def source_of(split: Path, config: CloneConfig, tell: Callable[[str], None]) -> PartedSplit:
-    """Open a split, and part its levels; leave out copies of sealed levels, and say so.
+    """Open a split, and divide its levels into training and validation; leave out copies of sealed levels, and say so.
 
     Raises:
-        UserError: the split is unusable, has sealed ids, or too few levels that are no copies.
+        UserError: the split is unusable, has sealed ids, or too few levels besides copies.
     """
     data = Dataset(split, config.where or None, (), config.validation)
     ids = data.manifest["level_id"].to_numpy()

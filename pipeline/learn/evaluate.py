@@ -130,7 +130,7 @@ def _groups(
 class _Entrant(NamedTuple):
     player: Player
     params: Any = ()
-    chance: bool = True  # whether attempts differ
+    chance: bool = True  # whether attempts differ by random draws
 
 
 def _entrants(policy: Policy | None) -> dict[str, _Entrant]:

@@ -27,7 +27,7 @@ from levelproof.pipeline.runtime import cache_folder
 PACKAGE = "kinetix-env==3.0.2"
 HANDMADE, RANDOM = "handmade", "reference-random"
 HANDMADE_LEVELS = {"s": 10, "m": 24, "l": 40}
-RANDOM_LEVELS = 512  # of a size
+RANDOM_LEVELS = 512  # levels per size
 
 
 class Protocol(NamedTuple):

@@ -13,7 +13,7 @@ from levelproof.pipeline.learn.sealed import known_sealed
 from levelproof.pipeline.learn.solve_rates import Solved
 from levelproof.pipeline.store.manifest import require_manifest
 
-ATTEMPTS = 16  # by which splits rate an expert if their configuration does not say
+ATTEMPTS = 16  # attempts per expert in splits whose configuration does not say
 
 
 class Specialists(NamedTuple):

@@ -33,7 +33,7 @@ class Fragment:
     """Metadata of one fragment, without its rows."""
 
     path: Path
-    config_hash: str  # of `config`
+    config_hash: str  # hash of `config`
     config: dict[str, Any]  # the settings that decide results, with current names
     digests: dict[str, dict[str, str]]  # of the files of each shard and checkpoint that its rows name
     rows: int

@@ -33,7 +33,7 @@ def split_url(parts: Sequence[str]) -> tuple[Repository, str]:
     """Split the parts of a URL after `hf://` into a repository and a path in it.
 
     Raises:
-        UserError: the URL is not of a dataset.
+        UserError: the URL does not name a dataset.
     """
     if len(parts) < 3 or parts[0] != "datasets":
         raise UserError(

@@ -52,7 +52,7 @@ class Origin(NamedTuple):
     split: str = ""  # absolute path of a split with the level
     shard: str = ""  # path below the split; empty: no shard has the level
     row: int = 0
-    level_id: int = 0  # in the shard
+    level_id: int = 0  # id of the level in the shard
 
 
 def origin_of(split: Path, row: Mapping[str, Any]) -> Origin:

@@ -13,7 +13,7 @@ from levelproof.pipeline.store.disk import NotRegular, regular, write_new
 
 CHECKSUM = 4  # bytes of a CRC-32C after each piece: a loss of power can leave other bytes
 TOUCH_INTERVAL = 60.0  # s between updates of a piece's time of use
-KEPT_SHARE = 0.9  # of the bound, to which an exceeded cache shrinks
+KEPT_SHARE = 0.9  # share of the bound to which an exceeded cache shrinks
 ABANDONED = 3600.0  # s; an older temporary file is from a killed process
 MAX_PIECE = 2**24  # bytes
 PARTS = 16  # the folder is scanned each time that 1/PARTS of the bound was added

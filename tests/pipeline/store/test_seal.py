@@ -317,7 +317,7 @@ class Stopped(Exception):
 
 @pytest.mark.parametrize(("committed", "left"), [(False, 0), (True, UNITS + 1), (True, 1)])
 def test_seal_stopped_at_any_file_loses_nothing(split: Path, made: Path, committed: bool, left: int) -> None:
-    """Stop the seal before its commit, or after it with `left` fragments: before it removes one or, if last, a shard."""
+    """Stop the seal before its commit, or after it with `left` fragments: before it removes one or, if last, shards."""
     fragment, asked = fragment_path(split, unit_name(0, 2 * UNITS - 1)), 0
     shards = len(list((split / "shards").iterdir()))
 
