@@ -185,9 +185,9 @@ class TrainingRun:
         levels, level_ids = self._some(kept)
         before, failed = [self.before.verdicts[i] for i in kept], self.before.failed_by_noop[kept]
         findings = submission.found
-        asked = np.flatnonzero(np.isin(self.left, kept))  # indices among the submitted levels
-        left = np.searchsorted(kept, self.left[asked])
-        trained = [trained[i] for i in asked]
+        submitted = np.flatnonzero(np.isin(self.left, kept))  # indices among the submitted levels
+        left = np.searchsorted(kept, self.left[submitted])
+        trained = [trained[i] for i in submitted]
         actions = np.zeros((RECORD_STEPS, ACTIONS, len(kept)), np.int32)  # a level without a witness does nothing
         candidates = [idling(verdict, actions[..., i]) if verdict else () for i, verdict in enumerate(before)]
         for i, level in zip(left, trained, strict=True):
@@ -202,7 +202,7 @@ class TrainingRun:
         judged = judge(trained, witnesses, take(record, left), config, failed[left])
         verdicts = {
             i: with_search(with_attempts(verdict, attempted.get(at)), findings, at, int(reworked[i]))
-            for i, verdict, at in zip(left.tolist(), judged, asked.tolist(), strict=True)
+            for i, verdict, at in zip(left.tolist(), judged, submitted.tolist(), strict=True)
         }
         shares = [None if witness is None else witness.portability for witness in chosen]
         known = [

@@ -91,14 +91,14 @@ def has_own(path: Path) -> bool:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(0, size - TAIL))
         start = max(0, _footer(file.read(), size) - OWN)
-        rest = hashlib.sha256()
+        digest = hashlib.sha256()
         file.seek(0)
         for first in range(0, start, BLOCK):
-            rest.update(file.read(min(BLOCK, start - first)))
+            digest.update(file.read(min(BLOCK, start - first)))
         own = file.read(OWN)
         while block := file.read(BLOCK):
-            rest.update(block)
-    return own == MARK + rest.digest()
+            digest.update(block)
+    return own == MARK + digest.digest()
 
 
 def _footer(end: bytes, size: int) -> int:

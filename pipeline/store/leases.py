@@ -213,8 +213,8 @@ def _taken(path: Path, text: bytes, say: Callable[[str], None]) -> Version:
             since = now
         before = writer, version
         if not writer or now - since > SILENCE or _died_here(holder):
-            if mine := put_if(path, text, version):
-                return mine
+            if lock_version := put_if(path, text, version):
+                return lock_version
         elif now - begun > NOTICE:
             say(
                 f"Waiting to see whether process {holder.get('pid')} on {holder.get('host')} still writes to "

@@ -190,11 +190,11 @@ def read_manifest(
     names = COLUMNS.names if columns is None else list(dict.fromkeys(["level_id", *columns]))
     if unknown := [name for name in names if name not in COLUMNS.names]:
         raise UserError(f"There is no column {unknown[0]!r}: the manifest has {', '.join(COLUMNS.names)}.")
-    asked = None if level_ids is None else ascending(np.asarray(level_ids, np.int64))
+    requested = None if level_ids is None else ascending(np.asarray(level_ids, np.int64))
     if is_seed(split):
-        parts = seed_parts(split, names, asked, compact, each)
+        parts = seed_parts(split, names, requested, compact, each)
     else:
-        parts = _parts(split, asked, partial(_part, names=names, level_ids=asked, compact=compact, each=each))
+        parts = _parts(split, requested, partial(_part, names=names, level_ids=requested, compact=compact, each=each))
     fragments = tuple(fragment for fragment, _ in parts)
     for fragment in fragments[1:]:
         if fragment.config_hash != fragments[0].config_hash:

@@ -269,6 +269,6 @@ def _experts(arrays: dict[str, np.ndarray], job: JobConfig) -> Iterator[tuple[in
     evaluations = unstacked(arrays, "evaluation/", evaluation, len(evaluated)) if len(evaluated) else []
     for i, (level_id, row) in enumerate(zip(level_ids.tolist(), rows, strict=True)):
         begun, pending, rollouts, findings = row
-        mine = [evaluations[j] for j in np.flatnonzero(evaluated == i)]
+        successes = [evaluations[j] for j in np.flatnonzero(evaluated == i)]
         findings = findings._replace(source=[Source(str(arrays["source"][i]))])
-        yield level_id, Paused(kept(begun, arrays["curve"][i]), pending, int(rollouts), mine, findings)
+        yield level_id, Paused(kept(begun, arrays["curve"][i]), pending, int(rollouts), successes, findings)

@@ -222,9 +222,9 @@ def read_together(
         return group.arrays
     groups = []
     for alike in by_encoding.values():
-        mine = [parts[i] for i in alike]
-        groups.append(mine[0][0].restore(mine, table, _one_after_another(mine)))
-        _report(mine, _one_after_another(mine), groups[-1].unlike, exactly)
+        members = [parts[i] for i in alike]
+        groups.append(members[0][0].restore(members, table, _one_after_another(members)))
+        _report(members, _one_after_another(members), groups[-1].unlike, exactly)
     back = np.argsort(np.concatenate([places[i] for alike in by_encoding.values() for i in alike]))
     return {name: np.concatenate([group.arrays[name] for group in groups])[back] for name in groups[0].arrays}
 

@@ -66,8 +66,8 @@ def _positions(path: Path, rows: pa.Table, about: SeedFile) -> np.ndarray:
     """Return the positions of rows in their file, of which some row groups may not have been read."""
     if rows.num_rows == about.fragment.rows:
         return np.arange(rows.num_rows)
-    everything = read_seed(path, [])[1].column("level_id").to_numpy()
-    return np.searchsorted(everything, rows.column("level_id").to_numpy())
+    all_ids = read_seed(path, [])[1].column("level_id").to_numpy()
+    return np.searchsorted(all_ids, rows.column("level_id").to_numpy())
 
 
 def manifest_rows(about: SeedFile, rows: pa.Table, names: Sequence[str], compact: bool) -> pa.Table:

@@ -34,9 +34,9 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
 
 
 def env_steps(out: str) -> int:
-    found = re.search(r"^([0-9,]+) env steps: ", out, re.MULTILINE)
-    assert found, out
-    return int(found[1].replace(",", ""))
+    match = re.search(r"^([0-9,]+) env steps: ", out, re.MULTILINE)
+    assert match, out
+    return int(match[1].replace(",", ""))
 
 
 @pytest.mark.parametrize(

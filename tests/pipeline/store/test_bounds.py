@@ -170,7 +170,7 @@ def test_read_fragment_survives_lying_size_statistics(good: Path) -> None:
     """With too many numbers in size statistics, pyarrow's `column` raises a C++ exception that ends the process."""
     data = good.read_bytes()
     start, end = footer_of(data).start, footer_of(data).stop
-    lists = [found.end() for found in re.finditer(rb"[\x19\x29\x39]\x26", data[start:end])]  # of two numbers
+    lists = [match.end() for match in re.finditer(rb"[\x19\x29\x39]\x26", data[start:end])]  # of two numbers
     assert len(lists) > 3
     for at in lists:
         footer = data[start : start + at - 1] + b"\x36\x02" + data[start + at : end]

@@ -173,7 +173,7 @@ def test_lengths_that_lie_are_refused(good: Path, tmp_path: Path) -> None:
 
 def test_unpacking_random_bytes_gives_actions_or_one_error() -> None:
     rng = np.random.default_rng(0)
-    found, refusals = 0, set()
+    unpacked, refusals = 0, set()
     for _ in range(1000):
         packed = [bytes(rng.integers(0, rng.choice([8, 30, 256]), rng.integers(0, 6)).astype(np.uint8))] * 2
         try:
@@ -181,9 +181,9 @@ def test_unpacking_random_bytes_gives_actions_or_one_error() -> None:
         except ValueError as error:
             refusals.add(str(error))
             continue
-        found += 1
+        unpacked += 1
         assert ((action >= 0) & (action < np.array(CHOICES)[:, None])).all()
-    assert found
+    assert unpacked
     assert all(sentence.startswith("its witnesses ") for sentence in refusals)
 
 

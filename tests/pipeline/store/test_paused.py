@@ -45,10 +45,10 @@ def kept() -> dict[int, Paused]:
         begun = filled(like)
         course = begun.training.course._replace(updates=np.asarray(updates, np.int32))
         begun = begun._replace(training=begun.training._replace(course=course))
-        found = nothing_found(1)._replace(source=[Source.SEARCH], search_steps=np.array([5]))
+        findings = nothing_found(1)._replace(source=[Source.SEARCH], search_steps=np.array([5]))
         pending = Pending(np.bool_(True), np.bool_(False), np.int32(9))
         return Paused(
-            KeptExpert(begun, [0.5] * updates), pending, 3, [filled(shown) for _ in range(evaluations)], found
+            KeptExpert(begun, [0.5] * updates), pending, 3, [filled(shown) for _ in range(evaluations)], findings
         )
 
     return {3: one(2, 0), 7: one(5, 2)}
