@@ -96,7 +96,7 @@ def _reason(error: RayError) -> str:
     """Return Ray's reason for a worker's death, as a sentence without its full stop."""
     lines = str(error).strip().splitlines()
     if isinstance(error, ActorDiedError):
-        return lines[-1] if error.actor_init_failed else "The worker died; if memory ran out, `dmesg` says so"
+        return lines[-1] if error.actor_init_failed else "The worker died; if memory ran out, `dmesg` shows it"
     return f"The worker died: {lines[0].rstrip('.')}"
 
 

@@ -75,7 +75,7 @@ def clone(splits: Sequence[Path], config: CloneConfig, out: Path, console: Conso
 
 
 def source_of(split: Path, config: CloneConfig, tell: Callable[[str], None]) -> PartedSplit:
-    """Open a split, and divide its levels into training and validation; leave out copies of sealed levels, and say so.
+    """Open a split and divide its levels into training and validation; report and leave out copies of sealed levels.
 
     Raises:
         UserError: the split is unusable, has sealed ids, or too few levels besides copies.

@@ -30,7 +30,7 @@ class TrainingLevels(NamedTuple):
 
 
 def levels_for(config: TrainConfig, tell: Callable[[str], None]) -> TrainingLevels:
-    """Return the levels that the settings name; leave out copies of sealed levels, and say so.
+    """Return the levels that the settings name; leave out copies of sealed levels, with a notice.
 
     Raises:
         UserError: there are none, or of several sizes, or sealed ones.

@@ -12,7 +12,7 @@ REGENERATE = ("regenerate", "manifest=OUT/128k/s", "budget=256k", "executor=inli
 
 
 class Operation(NamedTuple):
-    """A command and the state before it; `OUT` stands for the folder or the store's URL."""
+    """A command and the state before it; `OUT` is replaced by the folder or the store's URL."""
 
     words: tuple[str, ...]
     before: tuple[tuple[str, ...], ...] = ()  # commands that run first
