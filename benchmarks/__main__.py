@@ -67,9 +67,9 @@ def parser(chosen: str | None = None) -> argparse.ArgumentParser:
     """Return the parser of all benchmarks; only the chosen one has its arguments."""
     whole = argparse.ArgumentParser(
         prog="python -m benchmarks",
-        description="Measure this program, by itself and beside the reference (Kinetix 3.0.2) on the same machine, "
-        "levels and actions, in turns. The reference runs in its own environment, made on first use in the "
-        "cache folder (LEVELPROOF_CACHE_DIR); LEVELPROOF_ORACLE_PYTHON names a Python that already has it.",
+        description="Measure this program alone, or alternating with the reference (Kinetix 3.0.2) on the same "
+        "machine, levels and actions. The reference runs in its own environment, created on first use in the cache "
+        "folder (LEVELPROOF_CACHE_DIR); LEVELPROOF_ORACLE_PYTHON names a Python that already has it.",
         epilog="example: python -m benchmarks physics --size s --json",
     )
     names = whole.add_subparsers(dest="benchmark", metavar="BENCHMARK", required=True)

@@ -70,7 +70,7 @@ def _program(lanes: Lanes, params: Any, cores: int) -> tuple[Any, tuple]:
     coming = jax.random.randint(jax.random.key(0), (STEPS, total), 0, LEVELS)
     inputs = table, played, state, jnp.asarray(sticky_actions(STEPS, total)), coming
     rollout = lambda *inputs: lanes_rollout(lanes, *inputs)[0]
-    if cores == 1:  # as a caller runs it who does not divide the lanes
+    if cores == 1:  # as it runs for a caller who does not divide the lanes
         return jax.jit(rollout).lower(*inputs).compile(), inputs
     mesh = jax.make_mesh((cores,), ("core",), axis_types=(AxisType.Auto,), devices=jax.devices()[:cores])
     lanes_last = partial(jax.tree.map, lambda x: PartitionSpec(*[None] * (x.ndim - 1), "core"))

@@ -96,7 +96,7 @@ def measured(size: str, limit: int, lanes: int, turns: int) -> dict[str, Any]:
 
 
 def mapped(env: Any, params: Any, lanes: int) -> tuple[Any, Turn]:
-    """Return the episodes of `jax.vmap(env.reset)`, and a turn of `jax.vmap(env.step)`."""
+    """Return episodes from `jax.vmap(env.reset)` and a function that plays STEPS of `jax.vmap(env.step)`."""
     reset, step = jax.vmap(env.reset, (0, None)), jax.vmap(env.step, (0, 0, 0, None))
     choose = jax.vmap(env.action_space(params).sample)
 
@@ -117,7 +117,10 @@ def mapped(env: Any, params: Any, lanes: int) -> tuple[Any, Turn]:
 
 
 def in_lanes(env: Any, params: Any, lanes: int, count: int) -> tuple[Any, Turn]:
-    """Return the episodes of `Lanes.reset`, and a turn of `Lanes.step`; a lane's next level is one of `count`."""
+    """Return episodes from `Lanes.reset` and a function that plays STEPS of `Lanes.step`.
+
+    A lane's next level is one of `count`.
+    """
     ours = Lanes(env)
     table = jax.jit(ours.table)(params)
 

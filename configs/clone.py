@@ -14,12 +14,12 @@ class CloneConfig:
 
     where: str = "label = 'solved'"  # SQL condition on the manifest's columns that selects levels
     episodes: Literal["first", "all"] = "first"  # first: each record up to its first goal; all: whole records
-    mirror: bool = False  # also learn from mirrored witnesses, of those that solve their mirrored level
+    mirror: bool = False  # also learn from mirrored witnesses that solve their mirrored level
     validation: float = 0.1  # share of the levels that are kept from training, chosen by content hash
-    pool: int = 16_384  # levels in memory, between which every update draws evenly
-    refresh: int = 1000  # updates until other levels take their place, if the splits have more
+    pool: int = 16_384  # levels in memory; every update draws from all of them evenly
+    refresh: int = 1000  # updates until other levels replace those in memory, if the splits have more
     interval: int = 500  # updates between validations, each with a checkpoint
-    seed: int = 0  # of the initial weights and of what is drawn
+    seed: int = 0  # seed of the initial weights and of all random draws
     log: Literal["none", "tensorboard", "wandb"] = "none"  # logger of scalars, besides metrics.jsonl
     network: NetworkConfig = field(default_factory=NetworkConfig)  # network of the policy
     train: ImitationConfig = field(default_factory=ImitationConfig)  # training of the policy

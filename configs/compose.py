@@ -169,7 +169,7 @@ def _parse(text: str) -> Override:
     if override.is_add() or override.is_force_add() or override.is_delete():
         raise ConfigError(f"cannot use {text!r}: settings can be changed, not added or removed.")
     if override.is_sweep_override():
-        raise ConfigError(f"{key} has several values in {text!r}: one command makes one split, so give one.")
+        raise ConfigError(f"{key} has several values in {text!r}: one command makes one split, so set one value.")
     return override
 
 

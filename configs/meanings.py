@@ -1,7 +1,7 @@
 """Every setting with its default, meaning and unit, read from the source.
 
 A setting is a field of a frozen dataclass. The comment beside it is its meaning; a comment above it heads that field
-and those that follow. So whoever changes a default sees its meaning, and there is a single text to keep true.
+and those that follow. So an author who changes a default sees its meaning, and only one text must be kept true.
 """
 
 import ast

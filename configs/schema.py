@@ -22,16 +22,16 @@ from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.step import ENGINE_VERSION
 
 HASH_DIGITS = 16
-Density = Literal["full", "resume", "witness"]  # how much of a record is stored
+Density = Literal["full", "resume", "witness"]  # part of a record that is stored
 Executor = Literal["auto", "ray", "inline"]
 KEY_EVERY = 32  # default env steps between key frames
 KEYS_EVERY = tuple(2**i for i in range(1, 9))  # allowed values: each divides a record's 256 steps
 MAX_FRAME_SKIP = 64  # for densities whose readers re-simulate records
-MAX_BODIES = 48  # the largest number that was tried; compiling takes minutes there
-# Largest number of bodies, and levels of an untimed work unit: units take about equally long, and have multiples of
-# the number of experts that train side by side
+MAX_BODIES = 48  # the largest number that was tested; compiling takes minutes at that size
+# (most bodies, levels of an untimed work unit): units take about equally long, and their levels are multiples of the
+# number of experts that train side by side
 UNITS = ((SIZES["s"].bodies, 32), (SIZES["m"].bodies, 16), (SIZES["l"].bodies, 8), (MAX_BODIES, 4))
-GROWN_UNIT = 8  # units of records that grow from seeds, in units of trained levels
+GROWN_UNIT = 8  # size of a unit that grows records from seeds, as a multiple of a unit that trains
 
 # Settings of place, amount and machine: they change neither a level nor its expert, so a split may mix their values
 WITHOUT_EFFECT = frozenset(
@@ -56,9 +56,9 @@ WITHOUT_EFFECT = frozenset(
 )
 RENAMED: Mapping[str, str] = {}  # today's dotted names of settings by their names in earlier versions
 REMOVED: Mapping[str, Any] = {"scout.rounds": 0}  # settings of earlier versions: the value that matches this version
-# Values of `distribution` in the results of jobs whose levels are not sampled
+# Values of `distribution` in the hashed settings of jobs whose levels are not sampled
 FROM_FILES, FROM_RECORDS = "files", "import"
-# In the results of seed files and of splits grown from them: each record repeats its first episode
+# In the hashed settings of seed files and of splits grown from them: each record repeats its first episode
 REPEATED: Mapping[str, str] = {"witness": "repeated"}
 # Settings that decide the results of an import
 OF_RECORDS = ("size", "budget", "task", "sampler_version", "engine_version")
@@ -68,22 +68,22 @@ OF_RECORDS = ("size", "budget", "task", "sampler_version", "engine_version")
 class JobConfig:
     """The settings of a job of `levelproof generate`."""
 
-    size: str = "s"  # s, m, l, or numbers of polygons (4 are scenery), circles, joints and thrusters, as in 8-8-8-4
+    size: str = "s"  # s, m, l, or counts of polygons (4 are scenery), circles, joints, thrusters, as in 8-8-8-4
     levels: str = "64"  # number of levels, with consecutive ids
     first_level: int = 0  # id of the first level
     level_files: str = ""  # a level file, or a folder of them, to label instead of random levels; empty: random levels
     budget: str = "128k"  # env steps an expert may use; also names the folder
     out: str = "data"  # folder or object store's URL; the split is written to {out}/{budget}/{size}
-    unit: int | None = None  # levels per work unit, lost if its worker dies; null: as many as take 20 to 60 s, as timed
+    unit: int | None = None  # levels per work unit (redone if its worker dies); null: as many as take 20 to 60 s
     executor: Executor = "auto"  # ray: one worker per core or GPU; inline: this process; auto: inline if levels are few
-    device: Literal["cpu", "gpu"] = "cpu"  # of each worker; cpu: a core; gpu: a GPU, if one is free and JAX can use it
-    workers: int = 0  # maximum number; 0: one per core that memory allows, or with device=gpu one per GPU
+    device: Literal["cpu", "gpu"] = "cpu"  # cpu: each worker has a core; gpu: a GPU, if one is free and JAX can use it
+    workers: int = 0  # maximum number of workers; 0: one per core that memory allows, or with device=gpu one per GPU
     checkpoint: str = ""  # interval for saving unfinished experts to resume, such as 10min; empty: never
     keep_experts: bool = False  # store experts in the split, so that a larger budget can resume them
     density: Density = "full"  # stored part of a record: full (all), resume (states), witness (actions, key frames)
     key_every: int = KEY_EVERY  # env steps between key frames, for density=witness: a power of 2 from 2 to 256
     continue_from: str = ""  # a split made with keep_experts=true, whose experts are resumed; empty: none
-    log: Literal["none", "tensorboard", "wandb"] = "none"  # logger of a run's scalars: TensorBoard or Weights & Biases
+    log: Literal["none", "tensorboard", "wandb"] = "none"  # log a run's scalars to TensorBoard or Weights & Biases
     distribution: Distribution = field(default_factory=Distribution)  # distribution of random levels
     task: TaskParams = field(default_factory=TaskParams)  # rules of the task
     search: SearchConfig = field(default_factory=SearchConfig)  # search before training

@@ -7,7 +7,7 @@ from levelproof.experts.generalist.config import CurriculumConfig, PPOConfig
 from levelproof.experts.networks.over_levels import NetworkConfig
 from levelproof.physics.bounds import require
 
-CURRICULA = ("uniform", "learnability")  # of random levels
+CURRICULA = ("uniform", "learnability")  # curricula over random levels
 
 
 @dataclass(frozen=True)
@@ -15,17 +15,17 @@ class TrainConfig:
     """What to train on, and how."""
 
     levels: str = "uniform"  # uniform or learnability: random levels; else a split, or level files
-    size: str = "s"  # of random levels
+    size: str = "s"  # size of random levels
     distribution: str = "kinetix"  # preset of random levels
     where: str = "label NOT IN ('trivial', 'unsolvable')"  # SQL condition that selects levels of a split
-    start: str = ""  # folder of a policy to start from, whose network is taken; empty: from scratch
-    cores: int = 0  # CPU cores; 0: as many as share the lanes out evenly; a run keeps the number that it began with
+    start: str = ""  # folder of a policy to continue training, with its network; empty: from scratch
+    cores: int = 0  # CPU cores; 0: as many as divide the lanes evenly; a resumed run keeps its number
     interval: int = 25  # updates between lines of metrics, each with a checkpoint
-    seed: int = 0  # of the initial weights and of what is drawn
+    seed: int = 0  # seed of the initial weights and of all random draws
     log: Literal["none", "tensorboard", "wandb"] = "none"  # logger of scalars, besides metrics.jsonl
     network: NetworkConfig = field(default_factory=NetworkConfig)  # network of a policy from scratch
     ppo: PPOConfig = field(default_factory=PPOConfig)  # training of the policy
-    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)  # with levels=learnability
+    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)  # choice of levels with levels=learnability
 
     def __post_init__(self) -> None:
         require(self, ("interval",), 1)

@@ -34,7 +34,7 @@ class Entrant(NamedTuple):
 
     submission: Any  # a `Submission` of the batcher's kind
     position: int  # of the level in the submission
-    known: Any = None  # what it begins with besides the level
+    known: Any = None  # data besides the level that its slot begins with, such as the search's nearest trajectories
 
 
 class Batcher:

@@ -29,7 +29,7 @@ class Rule(StrEnum):
 class Choice(StrEnum):
     """Successes of an evaluation that can become a level's witness."""
 
-    RECORD = "record"  # attempts whose every finished episode reached the goal, automatic reset and all
+    RECORD = "record"  # attempts whose finished episodes, including those after a reset, all reached the goal
     SHORTEST = "shortest"  # the shortest successful episodes of any attempt, repeated to fill the record
 
 
@@ -45,9 +45,9 @@ class ExpertConfig:
     # experience
     environments: int = 32  # lanes of an expert
     horizon: int = 64  # env steps in each lane between updates
-    dense_reward_scale: float = 0.2  # 1/m, of the shaping reward in training; replaces task.dense_reward_scale
+    dense_reward_scale: float = 0.2  # 1/m; shaping reward in training, in place of task.dense_reward_scale
     rehearsals: int = 8  # lanes that repeat the first success, once there is one
-    persistence: float = 0.9  # until then, probability that these lanes repeat their last action
+    persistence: float = 0.9  # probability that these lanes repeat their last action until the first success
     # PPO (Schulman et al. 2017, arXiv:1707.06347)
     epochs: int = 4  # passes over the samples of an update
     minibatches: int = 4  # updates of the weights in an epoch
@@ -68,7 +68,7 @@ class ExpertConfig:
     witness: Choice = Choice.RECORD  # successes of an evaluation that can become a level's witness
     exploration: bool = True  # trained levels: if no evaluation succeeds, accept a success from search or training
     replays: int = (
-        32  # per candidate, from starts perturbed by a rounding error; 0: the first candidate becomes the witness
+        32  # per candidate witness, from starts perturbed by a rounding error; 0: the first candidate becomes it
     )
     # machine
     slots: int = 0  # experts that train side by side in one program; 0: chosen by device
@@ -117,7 +117,7 @@ class StopConfig:
 
     rule: Rule = Rule.HALVING  # when a level leaves its slot
     successes: int = 1  # attempts of an evaluation that must succeed for a level to be solved
-    share: float = 0.25  # of an update's finished episodes that must reach the goal to trigger an evaluation
+    share: float = 0.25  # share of an update's finished episodes that must reach the goal to trigger an evaluation
     wait: int = 2048  # env steps of training between a failed evaluation and the next; doubles each time
     polish: int = 0  # env steps of training after a level is solved, to shorten its witness; 0: none
     steady: int = 65_536  # env steps of training after a level is solved, if its witness is fragile; 0: none
@@ -147,7 +147,7 @@ def check_budget(budget: int, config: ExpertConfig, stopping: StopConfig) -> Non
     if budget < config.steps_per_update:
         raise ValueError(
             f"budget is {budget}: one update of an expert takes {config.steps_per_update} env steps "
-            f"({config.environments} environments x {config.horizon}): give at least that many"
+            f"({config.environments} environments x {config.horizon}): set at least that many"
         )
     if budget > MAX_COUNTED:
         raise ValueError(f"budget is {budget}: the maximum is {MAX_COUNTED} env steps")

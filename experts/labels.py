@@ -31,10 +31,10 @@ class Source(StrEnum):
 class Cause(IntEnum):
     """Why an expert stopped training for good."""
 
-    NONE = 0  # it has not: a larger budget would continue it
+    NONE = 0  # training has not stopped for good: a larger budget would continue it
     RUNG = 1  # the best return had not grown; in experts kept by earlier versions, any cause
-    FRUITLESS = 2  # no success of its own after `stop.fruitless` env steps
-    DIVERGED = 3  # its parameters were no longer finite
+    FRUITLESS = 2  # the expert itself had no success after `stop.fruitless` env steps
+    DIVERGED = 3  # the expert's parameters were no longer finite
 
 
 MADE_BY = {
@@ -42,7 +42,7 @@ MADE_BY = {
     Source.SCOUT: "actions of random play",
     Source.SEARCH: "actions of the search",
 }
-UNTRAINED = "no search reached the goal, and no expert was asked for"
+UNTRAINED = "no search reached the goal, and the procedure trains no expert"
 DIVERGED = "stopped being finite"  # in the reasons of levels whose experts diverged
 WITNESSED = frozenset({Label.SOLVED, Label.TRIVIAL})  # labels that need a witness
 TRAINED = frozenset({Label.SOLVED, Label.UNSOLVED})  # labels of levels that need an expert
@@ -73,7 +73,7 @@ class Verdict:
     evaluation_steps: int = 0  # env steps
     scout_steps: int = 0  # 0; earlier versions played at random before training
     search_steps: int = 0  # env steps
-    cells: int | None = None  # that the search reached; None: not searched
+    cells: int | None = None  # cells that the search reached; None: not searched
     still_grew: bool | None = None  # whether the archive was still growing when the search ended
 
 
@@ -107,7 +107,7 @@ def trivial_reason(steps: int) -> str:
 
 ARGUMENTS = {
     Proof.NOTHING_ACTS: "no action has an effect",
-    Proof.GOAL_STANDS: "no green and blue body that could touch ever move",
+    Proof.GOAL_STANDS: "no green or blue body that could touch the other colour ever moves",
 }
 
 

@@ -79,7 +79,7 @@ class Ledger:
         self._seconds[stage][index] += seconds
 
     def take(self, other: "Ledger", indices: Int[np.ndarray, " index"]) -> None:
-        """Add another ledger, whose levels have these indices here."""
+        """Add another ledger's seconds; its levels have these indices in this ledger."""
         for stage, theirs in other._seconds.items():
             self._seconds[stage][indices] += theirs
 

@@ -90,7 +90,7 @@ def concatenate_levels(parts: Sequence[Level]) -> Level:
 
 
 def size_of(name: str | Size) -> Size:
-    """Return the size that a name stands for: one of SIZES, or four numbers as in `8-8-8-4`. A Size stays unchanged.
+    """Return the size of a name: one of SIZES, or four numbers as in `8-8-8-4`. A Size stays unchanged.
 
     The numbers count polygons (the scenery's four included), circles, joints and thrusters.
 

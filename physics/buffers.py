@@ -29,7 +29,7 @@ def axes_of(size: Size) -> dict[str, int]:
         "kind": KINDS,
         "group": GROUPS,
         "listing": sum(len(kind) * kind.batches for kind in pairs.by_group)
-        + 1,  # one more: `contact.assign_batches` writes past the last
+        + 1,  # one spare element: `contact.assign_batches` writes past the last
         "boundary": sum(kind.batches for kind in pairs.by_group) + 1,
     }
 

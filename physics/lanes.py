@@ -20,7 +20,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-NOBODY = -1  # stands for "no body" in an index
+NOBODY = -1  # index that means "no body"
 
 Scalar = Int[Array, ""] | int
 T = TypeVar("T")

@@ -30,7 +30,7 @@ FLIP_BIAS = 0.01  # m; b must separate this much more than a to become the refer
 # rad; Jax2D turns edges into normals by rmat(pi / 2) in single precision, whose cosine is -4.371139e-8: its faces lean
 # by that much, so of equally deep corners the one nearer to the face's start comes first (docs/physics.md, "Ties")
 TILT = 4.371139e-8
-FAR = 1e30  # m; stands for a vertex or edge that does not exist
+FAR = 1e30  # m; distance of a vertex or edge that does not exist
 # m; pairs whose bounding boxes are farther apart are skipped. Convex clockwise polygons cannot touch there, whatever
 # the rounding; for degenerate ones the separating axes may report a distant contact, which this margin discards
 MARGIN = 0.01

@@ -74,7 +74,7 @@ class Table(NamedTuple):
     b: Int[Rows, "contact"]  # second body
     kept: Float[Rows, "contact"]  # 0 where the padding defect forgets the accumulated impulses, else 1
     start: Int[Rows, "group"]  # first contact
-    kind: Int[Rows, "group"]  # of its pairs
+    kind: Int[Rows, "group"]  # kind of the group's pairs
     pairs: Float[Rows, "group"]  # number of pairs of the kind
     batches: Float[Rows, "group"]  # number of solver batches of the kind
     group: Int[Rows, "segment"]

@@ -22,7 +22,7 @@ FIXED_POLYGONS = 4  # floor, left wall, right wall, ceiling; pairs among them ar
 MAX_VERTICES = 4  # of a polygon; a triangle leaves its fourth vertex unused
 SOLVER_BATCH = 16  # pairs that read the same velocities; the reference's result depends on it
 SOLVER_ITERATIONS = 10  # fewer: stacks sag and chains stretch; more: slower, and no longer the reference's result
-MAX_CONSTANT = 1e6  # upper bound of every constant in Params: beyond any use, and products stay finite in float32
+MAX_CONSTANT = 1e6  # upper bound of every constant in Params: above useful values, and products stay finite in float32
 
 
 class Size(NamedTuple):
@@ -43,22 +43,22 @@ class Params:
     """Constants of the engine (hashable: pass as a static argument). Defaults: `SimParams` of Jax2D 1.0.1."""
 
     dt: float = 1 / 60  # s; larger: faster and less stable
-    slop: float = 0.01  # m of penetration left alone; larger: visible overlap, smaller: jitter
+    slop: float = 0.01  # m of penetration that contacts tolerate; larger: visible overlap, smaller: jitter
     contact_bias: float = 0.2  # share of the penetration beyond the slop undone per step; near 1: bodies jump apart
     joint_bias_velocity: float = 2.0  # 1/s; pull of a joint's ends towards each other; larger: stiffer, then unstable
     joint_bias_position: float = 0.7  # share of the gap closed per solver iteration; above 1: overshoots
     fixed_joint_bias: float = 2.0  # 1/s; pull of a fixed joint to its angle
     joint_limit_bias: float = 5.0  # 1/s; pull of a joint back within its limits
     joint_stiffness: float = 0.6  # share of the joint impulse applied per solver iteration; near 1: chains oscillate
-    max_position: float = 15.0  # m, to either side; bodies are kept within
-    max_velocity: float = 100.0  # m/s, of each axis, to either side
-    max_angular_velocity: float = 50.0  # rad/s, to either side
+    max_position: float = 15.0  # m from 0 on each axis, within which bodies are kept
+    max_velocity: float = 100.0  # m/s, limit on each axis in either direction
+    max_angular_velocity: float = 50.0  # rad/s, limit in either direction
     motor_speed: float = 6.0  # rad/s, of a joint whose motor speed is 1
     motor_power: float = 900.0  # N m per kg m^2, of a joint whose motor power is 1
-    motor_decay: float = 0.1  # s/rad; steepness of the speed control
+    motor_decay: float = 0.1  # s/rad; steepness of a motor's speed control
     motor_limit_zone: float = 0.1  # rad; a motor weakens this near to a joint limit
     thruster_power: float = 10.0  # N, of a thruster whose power is 1
-    base_friction: float = 0.4  # times the friction of each body, in every contact
+    base_friction: float = 0.4  # multiplies the friction of each body, in every contact
     faithful_padding: bool = True  # reproduce the reference's padding defect, see docs/physics.md
 
     def __post_init__(self) -> None:
@@ -98,14 +98,14 @@ class Model:
     joint_min: Float[Array, "joint lane"]  # rad
     joint_max: Float[Array, "joint lane"]
     motor_on: Bool[Array, "joint lane"]
-    motor_speed: Float[Array, "joint lane"]  # of Params.motor_speed
-    motor_power: Float[Array, "joint lane"]  # of Params.motor_power
+    motor_speed: Float[Array, "joint lane"]  # as a multiple of Params.motor_speed
+    motor_power: Float[Array, "joint lane"]  # as a multiple of Params.motor_power
     # thrusters
     thruster_active: Bool[Array, "thruster lane"]
     thruster_body: Int[Array, "thruster lane"]
     thruster_position: Float[Array, "thruster 2 lane"]  # in the frame of the body
     thruster_rotation: Float[Array, "thruster lane"]  # rad, relative to the body
-    thruster_power: Float[Array, "thruster lane"]  # of Params.thruster_power
+    thruster_power: Float[Array, "thruster lane"]  # as a multiple of Params.thruster_power
 
     @property
     def size(self) -> Size:

@@ -68,7 +68,7 @@ def _regular(path: str, flags: int) -> int:
 
 
 def share_compiling() -> None:
-    """Patch JAX to claim each program that its cache lacks, and to read it if another process compiled it meanwhile."""
+    """Patch JAX to claim each program that its cache lacks, and to read it if another process compiled it first."""
     from jax._src import compilation_cache, compiler
 
     compile_and_write = compiler._compile_and_write_cache

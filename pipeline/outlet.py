@@ -62,5 +62,5 @@ def _flush(outlet: Outlet) -> None:
 
 
 def has_reader() -> bool:
-    """Whether no write to standard output has yet found its reader gone."""
+    """Whether every write to standard output so far has found a reader."""
     return getattr(sys.stdout, "has_reader", True)

@@ -1,4 +1,4 @@
-"""Paths that stand for URLs, such as `Path("s3://bucket/split")`, although `Path` collapses their slashes."""
+"""Paths that represent URLs, such as `Path("s3://bucket/split")`, although `Path` collapses their slashes."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Formatting numbers for people."""
+"""Formatting numbers for display."""
 
 
 def number(value: float) -> str:

@@ -45,7 +45,7 @@ def pytest_report_header() -> str:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that run the reference as campaigns: golden states stand for it in the other tests."""
+    """Mark the tests that run the reference as campaigns: golden states replace it in the other tests."""
     for item in items:
         if "reference" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.campaign)

@@ -44,7 +44,7 @@ def become(name: str) -> None:
 
 
 def run_on(name: str, module: str, *arguments: str, python: str | Path = sys.executable) -> str:
-    """Run a module in a process that plays this processor, without a cache of programs; return what it prints."""
+    """Run a module in a process that poses as this processor, without a cache of programs; return what it prints."""
     _, newest = PROCESSORS[name]
     flags = [os.environ.get("XLA_FLAGS", ""), *([f"--xla_cpu_max_isa={newest}"] if newest else [])]
     environment = os.environ | {"XLA_FLAGS": " ".join(flags).strip(), "JAX_ENABLE_COMPILATION_CACHE": "false"}

@@ -187,7 +187,7 @@ def test_levelproof_package_has_no_logic() -> None:
 
 
 def test_class_names_are_unique() -> None:
-    """So a class name tells its file."""
+    """A class name identifies its file."""
     homes = defaultdict(list)
     for path in SOURCES:
         for node in ast.walk(ast.parse(path.read_text())):

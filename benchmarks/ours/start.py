@@ -16,4 +16,4 @@ def begin(*_: object) -> None:
 if __name__ == "__main__":
     inline.run = begin  # type: ignore[assignment]
     generate(compose_job(["executor=inline", *sys.argv[1:]]), [], Console(stderr=True))
-    sys.exit("Every level is already there: nothing would start.")
+    sys.exit("The split already has every level, so nothing would start: name a new folder.")

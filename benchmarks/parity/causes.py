@@ -150,8 +150,8 @@ class Bodies:
     """The bodies and contacts that a difference involves, in one world."""
 
     worst: int  # the movable body that is off most
-    group: Bool[np.ndarray, " body"]  # those it touches or is joined to, directly or through others
-    contacts: Bool[np.ndarray, " contact"]  # those that act on the group
+    group: Bool[np.ndarray, " body"]  # bodies that it touches or is joined to, directly or through others
+    contacts: Bool[np.ndarray, " contact"]  # contacts that act on the group
 
     @staticmethod
     def off(before: Level, ours: Stepped, theirs: Stepped) -> "Bodies":

@@ -64,7 +64,7 @@ class Parted:
 
 @dataclass(frozen=True)
 class Episodes:
-    """The pairs of one size."""
+    """Pairs of episodes of one size, played in both engines: counts and shares of equal outcomes."""
 
     pairs: int
     touched: int  # number that end by touching blue or red in the reference

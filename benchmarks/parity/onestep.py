@@ -69,7 +69,7 @@ class OffState:
 
     scene: str
     origin: str
-    by: dict[str, float]  # differences of the fields that are off
+    by: dict[str, float]  # difference of each field that is off, by name
     other_contacts: int
     cause: str
     explained: bool

@@ -30,7 +30,7 @@ SCHEMA = pa.schema(
         ("evaluation_steps", pa.int64()),  # env steps, as the next two; null: not counted
         ("scout_steps", pa.int64()),
         ("search_steps", pa.int64()),
-        ("witness", WORD),  # its source; null: no witness, or not recorded
+        ("witness", WORD),  # source of the witness; null: no witness, or not recorded
         # of sampled first episodes after training (older rows: in the last evaluation); null: none ended
         ("success_rate", pa.float64()),
         ("most_probable_succeeds", pa.bool_()),  # in the last evaluation; null: not recorded

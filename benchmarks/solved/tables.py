@@ -73,7 +73,7 @@ def line(results: Results) -> list[str]:
 
 
 def reaches(row: Mapping[str, Any]) -> bool | None:
-    """Whether the expert of a solved level reaches the goal by itself, whoever found the witness; None: unknown."""
+    """Whether the expert of a solved level reaches the goal by itself, whatever found the witness; None: unknown."""
     if row["witness"] in BY_EXPERT or (row["success_rate"] or 0) > 0:
         return True
     return row["most_probable_succeeds"]

@@ -140,7 +140,7 @@ class EntityNetwork(nn.Module):
 
 
 def active_entities(levels: Level) -> list[Float[Array, "entity level"]]:
-    """Return 1 for active entities, by kind; the floor stands for all scenery."""
+    """Return 1 for active entities, by kind; the floor represents all scenery."""
     model, size = levels.model, levels.size
     polygons = jnp.concatenate([model.active[:1], model.active[FIXED_POLYGONS : size.polygons]])
     kinds = (polygons, model.active[size.polygons :], model.joint_active, model.thruster_active)

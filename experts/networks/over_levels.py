@@ -57,7 +57,7 @@ class NetworkConfig:
         if self.kind is PolicyKind.ATTENTION and self.width % self.heads:
             raise ValueError(f"width is {self.width}: it must be a multiple of heads = {self.heads}")
         if self.kind is PolicyKind.TRANSFORMER and self.heads % MASKS:
-            raise ValueError(f"heads is {self.heads}: the transformer's are a multiple of {MASKS}")
+            raise ValueError(f"heads is {self.heads}: it must be a multiple of {MASKS} for the transformer")
 
     @property
     def observation_type(self) -> ObservationType:

@@ -122,7 +122,9 @@ def load_policy(folder: str | os.PathLike[str]) -> Policy:
             raise FileNotFoundError
         config = json.loads((path / CONFIG).read_text())
         if config["format"] != FORMAT:
-            raise PolicyError(f"The policy {path} has format {config['format']}, this version reads {FORMAT}: update.")
+            raise PolicyError(
+                f"The policy {path} has format {config['format']}, but this levelproof reads {FORMAT}: update it."
+            )
         shape = config["network"]
         network = NetworkConfig(**shape | {"kind": PolicyKind(shape["kind"])})
         size = None if config["size"] is None else size_of(config["size"])
@@ -166,9 +168,9 @@ def unnamed(like: Any, arrays: Mapping[str, np.ndarray]) -> Any:
     """
 
     def find(path: Any, x: Any) -> Array:
-        found = arrays.get(name := jax.tree_util.keystr(path))
-        if found is None or found.shape != x.shape or found.dtype != x.dtype:
+        array = arrays.get(name := jax.tree_util.keystr(path))
+        if array is None or array.shape != x.shape or array.dtype != x.dtype:
             raise ValueError(f"the array {name} is missing or has another shape")
-        return jnp.asarray(found)
+        return jnp.asarray(array)
 
     return jax.tree_util.tree_map_with_path(find, like)

@@ -28,11 +28,11 @@ class Gate(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "lane token unit"], y: Float[Array, "lane token unit"]) -> Array:
-        of = lambda name: nn.Dense(self.width, use_bias=False, name=name)
-        reset = nn.sigmoid(of("reset_y")(y) + of("reset_x")(x))
+        dense = lambda name: nn.Dense(self.width, use_bias=False, name=name)
+        reset = nn.sigmoid(dense("reset_y")(y) + dense("reset_x")(x))
         bias = self.param("bias", nn.initializers.zeros, (self.width,))
-        share = nn.sigmoid(of("share_y")(y) + of("share_x")(x) - bias)
-        new = nn.tanh(of("new_y")(y) + of("new_x")(reset * x))
+        share = nn.sigmoid(dense("share_y")(y) + dense("share_x")(x) - bias)
+        new = nn.tanh(dense("new_y")(y) + dense("new_x")(reset * x))
         return (1 - share) * x + share * new
 
 
@@ -72,8 +72,8 @@ class TransformerPolicy(nn.Module):
         ends, hulls = observation.joint_indexes + 1, observation.thruster_indexes + 1
         for i in range(self.blocks):
             x = GatedBlock(self.width, self.heads, name=f"block_{i}")(x, mask)
-            along = jnp.concatenate([_of(x, ends[..., 0]), _of(x, ends[..., 1]), joints], -1)
-            pushed = jnp.concatenate([_of(x, hulls), thrusters], -1)
+            along = jnp.concatenate([_rows_at(x, ends[..., 0]), _rows_at(x, ends[..., 1]), joints], -1)
+            pushed = jnp.concatenate([_rows_at(x, hulls), thrusters], -1)
             messages = nn.Dense(self.width, name=f"joints_{i}")(along) * observation.joint_mask[..., None]
             pushes = nn.Dense(self.width, name=f"thrusters_{i}")(pushed) * observation.thruster_mask[..., None]
             x = _added(_added(x, ends[..., 0], messages), hulls, pushes)
@@ -92,7 +92,7 @@ class TransformerPolicy(nn.Module):
         return jnp.concatenate([encoded, jnp.full((*encoded.shape[:2], 1), float(kind))], -1)
 
 
-def _of(x: Float[Array, "lane token unit"], index: Int[Array, "lane entity"]) -> Float[Array, "lane entity unit"]:
+def _rows_at(x: Float[Array, "lane token unit"], index: Int[Array, "lane entity"]) -> Float[Array, "lane entity unit"]:
     return jnp.take_along_axis(x, index[..., None], 1)
 
 

@@ -20,7 +20,7 @@ class SearchFindings(NamedTuple):
     success: Success
     source: list[Source]  # of the success, or of the one that training may find
     search_steps: Int[np.ndarray, " level"]  # 0: not searched
-    cells: Int[np.ndarray, " level"]  # that the search reached
+    cells: Int[np.ndarray, " level"]  # cells that the search reached
     still_grew: Bool[np.ndarray, " level"]  # whether the archive was growing when the search ended
 
 
@@ -30,10 +30,10 @@ def nothing_found(count: int) -> SearchFindings:
     return SearchFindings(no_success(count), [Source.EXPLORATION] * count, zeros, zeros.copy(), zeros.astype(bool))
 
 
-def row_of(found: SearchFindings, index: int) -> SearchFindings:
+def row_of(findings: SearchFindings, index: int) -> SearchFindings:
     """Select one level."""
-    arrays = jax.tree.map(lambda x: x[index : index + 1], found._replace(source=()))
-    return arrays._replace(source=[found.source[index]])
+    arrays = jax.tree.map(lambda x: x[index : index + 1], findings._replace(source=()))
+    return arrays._replace(source=[findings.source[index]])
 
 
 def joined(parts: Sequence[SearchFindings], order: Int[np.ndarray, " level"]) -> SearchFindings:

@@ -16,5 +16,5 @@ class Paused(NamedTuple):
     expert: KeptExpert
     pending: Pending
     evaluated_rollouts: int  # of finished evaluations
-    evaluations: list[Evaluation]  # those that solved the level
-    found: SearchFindings  # of its one level
+    evaluations: list[Evaluation]  # evaluations that solved the level
+    found: SearchFindings  # findings of its only level

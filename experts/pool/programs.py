@@ -31,7 +31,7 @@ class Program(NamedTuple):
 
     function: Any
     call: Callable[[], tuple[tuple[Any, ...], dict[str, Any]]]  # makes the positional and named arguments
-    stage: str = ""  # whose slots; tells programs of one function apart
+    stage: str = ""  # stage whose slots it serves; distinguishes programs of one function
 
     @property
     def name(self) -> str:

@@ -1,4 +1,4 @@
-"""Rework of witnesses before they count: polish them if asked for, and steady them if replays fail."""
+"""Rework of witnesses before they count: polish them if configured, and steady them if replays fail."""
 
 from collections.abc import Callable, Sequence
 

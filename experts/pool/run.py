@@ -85,14 +85,14 @@ class TrainingRun:
         if self.submission or self.search.under_way:
             return
         with self.ledger.timing("search"):
-            found = findings_of(self.pool.searching.result(self.search))
+            findings = findings_of(self.pool.searching.result(self.search))
         self.ledger.take(self.search.ledger, self._searched)
         some = self.left if self.pool.procedure.stop.rule != Rule.NONE else self.left[:0]
         levels, level_ids = self._some(some)
         among = lambda known: {i: known[one] for i, one in enumerate(level_ids.tolist()) if one in known}
-        found = joined([found, *(one.found for one in self._paused.values())], self._order)
+        findings = joined([findings, *(one.found for one in self._paused.values())], self._order)
         self.submission = self.pool.submit(
-            levels, level_ids, found, among(self._begun), self._keep, among(self._paused)
+            levels, level_ids, findings, among(self._begun), self._keep, among(self._paused)
         )
         if self._left_out:
             self.leave_out(self._left_out)
@@ -163,7 +163,7 @@ class TrainingRun:
         return replace(result, ledger=ledger)
 
     def _attempted(self, trained: Sequence[TrainedLevel]) -> dict[int, tuple[float, int]]:
-        """Measure experts' success rates; return each with its env steps, by index among `left`."""
+        """Measure experts' success rates; return (rate, env steps it took) by index into `left`."""
         policies = {
             i: level.policy
             for i, (index, level) in enumerate(zip(self.left, trained, strict=True))
@@ -184,10 +184,10 @@ class TrainingRun:
         kept = np.flatnonzero(~np.isin(self.level_ids, list(self._left_out)))
         levels, level_ids = self._some(kept)
         before, failed = [self.before.verdicts[i] for i in kept], self.before.failed_by_noop[kept]
-        found = submission.found
-        asked = np.flatnonzero(np.isin(self.left, kept))  # indices among the submitted levels
-        left = np.searchsorted(kept, self.left[asked])
-        trained = [trained[i] for i in asked]
+        findings = submission.found
+        submitted = np.flatnonzero(np.isin(self.left, kept))  # indices among the submitted levels
+        left = np.searchsorted(kept, self.left[submitted])
+        trained = [trained[i] for i in submitted]
         actions = np.zeros((RECORD_STEPS, ACTIONS, len(kept)), np.int32)  # a level without a witness does nothing
         candidates = [idling(verdict, actions[..., i]) if verdict else () for i, verdict in enumerate(before)]
         for i, level in zip(left, trained, strict=True):
@@ -201,8 +201,8 @@ class TrainingRun:
         witnesses = [chosen[i] for i in left]
         judged = judge(trained, witnesses, take(record, left), config, failed[left])
         verdicts = {
-            i: with_search(with_attempts(verdict, attempted.get(at)), found, at, int(reworked[i]))
-            for i, verdict, at in zip(left.tolist(), judged, asked.tolist(), strict=True)
+            i: with_search(with_attempts(verdict, attempted.get(at)), findings, at, int(reworked[i]))
+            for i, verdict, at in zip(left.tolist(), judged, submitted.tolist(), strict=True)
         }
         shares = [None if witness is None else witness.portability for witness in chosen]
         known = [
@@ -227,20 +227,20 @@ def with_attempts(verdict: Verdict, attempted: tuple[float, int] | None) -> Verd
     return replace(verdict, success_rate=rate, evaluation_steps=verdict.evaluation_steps + env_steps)
 
 
-def with_search(verdict: Verdict, found: SearchFindings, index: int, reworked: int) -> Verdict:
+def with_search(verdict: Verdict, findings: SearchFindings, index: int, reworked: int) -> Verdict:
     """Add results of the search before training, and the env steps of rework."""
-    searched = int(found.search_steps[index])
+    searched = int(findings.search_steps[index])
     return replace(
         verdict,
         search_steps=searched + reworked,
-        cells=int(found.cells[index]) if searched else None,
-        still_grew=bool(found.still_grew[index]) if searched else None,
+        cells=int(findings.cells[index]) if searched else None,
+        still_grew=bool(findings.still_grew[index]) if searched else None,
     )
 
 
-def as_found(found: SearchFindings) -> list[TrainedLevel]:
+def as_found(findings: SearchFindings) -> list[TrainedLevel]:
     """Wrap levels without an expert: their candidates are the successes of the search."""
-    each = zip(found.success.action, found.success.length, found.source, strict=True)
+    each = zip(findings.success.action, findings.success.length, findings.source, strict=True)
     return [
         TrainedLevel([], [], candidates=repeating(Success(action, length), source)) for action, length, source in each
     ]

@@ -32,7 +32,7 @@ class Steadying(NamedTuple):
 
     code: UInt16[Array, "level step"]  # codes of the success's actions
     length: Int[Array, " level"]  # of the success, env steps
-    steady: Bool[Array, " level"]  # it has survived all replays of a round
+    steady: Bool[Array, " level"]  # the witness has survived all replays of a round
     env_steps: Int[Array, " level"]  # of all lanes
     number: Int[Array, ""]  # of rounds done
 

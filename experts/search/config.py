@@ -28,10 +28,10 @@ class StopLimits(NamedTuple):
 class SearchConfig:
     """Settings of a search (hashable: pass as a static argument)."""
 
-    env_steps: int = 1_048_576  # per level, all lanes together; rounded up to whole rounds; 0: no search
-    bodies: int = 7  # of the largest world that gets all env steps; above, n bodies get (bodies/n)²; 0: no scaling
-    variations: int = 262_144  # env steps of variations of the nearest trajectories, after that; 0: none
-    patience: int = 393_216  # env steps without progress until a level leaves (variations: a quarter); 0: no limit
+    env_steps: int = 1_048_576  # per level, over all lanes; rounded up to whole rounds; 0: no search
+    bodies: int = 7  # largest world that gets all env steps; larger ones, of n, get (bodies/n)² of them; 0: no scaling
+    variations: int = 262_144  # env steps after the search, on variations of the nearest trajectories; 0: none
+    patience: int = 393_216  # env steps without progress before a level leaves (variations: a quarter); 0: no limit
     first_rung: int = 16_384  # env steps at the first rung; each rung quadruples them
     per_cell: int = 512  # maximum env steps per cell reached for a level to pass a rung; 0: no limit
     # play
@@ -44,21 +44,21 @@ class SearchConfig:
     )  # probability of resampling an entry of the action, per env step
     segment: int = 8  # env steps between visits to the archive
     stretch: int = 4  # segments that a lane plays before it returns to an archived state
-    anew: float = 0.5  # share of returns after which the whole action is resampled; else it is kept at first
+    anew: float = 0.5  # share of returns that start with a new random action; others repeat the archived state's last
     # archive
     entries: int = 512  # archived states per level
-    nearer: float = 0.5  # share of returns that pick the nearer to the goal of two states
-    # cells: weighted distances of bodies, in metres, tell states apart
+    nearer: float = 0.5  # share of returns that draw two states and pick the one nearer to the goal
+    # cells: states are told apart by weighted distances of bodies, in metres
     width: float = 0.05  # m, width of a cell until the archive is full
     growth: float = 1.15  # factor by which cells widen each time the archive is full
-    driven_weight: float = 0.5  # weight of bodies that actuators move, neither green nor blue; all others: 1
+    driven_weight: float = 0.5  # weight of bodies that actuators move, unless green or blue; all others: 1
     # a success
-    trials: int = 4  # rounds of attempts to shorten it, one per lane; the first also verifies it
+    trials: int = 4  # rounds of attempts to shorten a success, one per lane; the first also verifies it
     # a witness
-    polish: int = 0  # env steps of search around it for a shorter one, rounded up to whole rounds; 0: none
-    steady: int = 8  # rounds of search around a fragile one for a more robust one; 0: none
+    polish: int = 0  # env steps of search around a witness for a shorter one, rounded up to whole rounds; 0: none
+    steady: int = 8  # rounds of search around a fragile witness for a more robust one; 0: none
     # machine
-    rounds: int = 2  # per device call, between host syncs
+    rounds: int = 2  # rounds per device call, between host syncs
 
     def __post_init__(self) -> None:
         require(self, ("bodies", "per_cell", "patience"), 0, MAX_COUNTED)
@@ -89,8 +89,8 @@ class SearchConfig:
         An env step costs about the square of the number of bodies.
         """
         share = min(1.0, (self.bodies / bodies) ** 2) if self.bodies else 1.0
-        less = {name: int(getattr(self, name) * share) for name in ("env_steps", "variations", "patience")}
-        return replace(self, **less)
+        reduced = {name: int(getattr(self, name) * share) for name in ("env_steps", "variations", "patience")}
+        return replace(self, **reduced)
 
     @property
     def steps_per_round(self) -> int:

@@ -76,7 +76,7 @@ def shortening(length: Int[Array, ""], bits: UInt32[Array, "draw"], live: Bool[A
 
 
 def variation(length: Int[Array, ""], bits: UInt32[Array, "draw"], live: Bool[Array, "6"]) -> Edit:
-    """In half of cases, resample live entries for a stretch; in three quarters of these, and in all others, shorten."""
+    """Resample live entries for a stretch in half of cases; shorten in three quarters of these and in all others."""
     resamples, shortens = bits[6] >> 31 == 1, (bits[6] >> 29) % 4 > 0
     edit = jax.tree.map(lambda x: jnp.where(shortens | ~resamples, x, 0), shortening(length, bits, live))
     return edit._replace(

@@ -222,7 +222,7 @@ def changed(
 
 
 def change_of(steps: Int[Array, ""], bits: UInt32[Array, "5"], live: Bool[Array, "6"]) -> Edit:
-    """In half of cases, resample live entries for a stretch; else play the rest of the trajectory sooner or later."""
+    """Resample live entries for a stretch in half of cases; else play the rest of the trajectory sooner or later."""
     length, kind = jnp.maximum(steps, 1), bits[4] & 3
     first, some = below(bits[0], length), stretch(bits[1], length)
     by = jnp.minimum(some, 1 + below(bits[4] >> 2, MAX_MOVED))

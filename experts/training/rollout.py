@@ -23,7 +23,7 @@ class Acting(NamedTuple):
     """Unfinished episodes."""
 
     world: TaskState
-    last_action: Int[Array, "6 lane"]  # in this episode; 0 at its start
+    last_action: Int[Array, "6 lane"]  # last action of this episode; 0 at its start
 
 
 class ActionRule(NamedTuple):

@@ -86,7 +86,7 @@ class EvaluationState(NamedTuple):
     part: Int[Array, ""]  # rollouts done
     due: Bool[Array, ""]  # training triggered it
     final: Bool[Array, ""]  # the level leaves afterwards
-    solved: Bool[Array, ""]  # it has ended with enough successes
+    solved: Bool[Array, ""]  # the evaluation has ended with enough successes
     action: Int[Array, "time 6 attempt"]
     done: Bool[Array, "time environment"]
     goal: Bool[Array, "time environment"]
@@ -120,7 +120,7 @@ class Report(NamedTuple):
     share: Float[Array, " slot"]  # share of a training slot's finished episodes that reached the goal
     evaluated: Bool[Array, " slot"]  # an evaluation ended and solved the level, or the level left
     left: Bool[Array, " slot"]
-    early: Bool[Array, " slot"]  # it left solved, before its final evaluation
+    early: Bool[Array, " slot"]  # the level left solved, before its final evaluation
 
 
 @partial(jax.jit, static_argnames="config")

@@ -1,4 +1,4 @@
-"""Imported actions: replay them here, and label their levels by the result."""
+"""Imported actions: replay them in this engine, and label their levels by the result."""
 
 import jax
 import numpy as np
@@ -12,9 +12,9 @@ from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.rules import TaskParams
 
-AGAIN = "the actions of the first imported episode, again and again, reach the goal"
+AGAIN = "the actions of the first imported episode, repeated, reach the goal"
 WHOLE = "the imported actions reach the goal in all {} of their finished episodes"
-MISSED = "the imported actions do not reach the goal here: {}"
+MISSED = "the imported actions do not reach the goal when replayed: {}"
 
 
 def label_given(
@@ -48,7 +48,7 @@ def label_given(
             reason = WHOLE.format(episodes[i]) if whole[i] else AGAIN
             verdict = untrained(Label.SOLVED, reason, bool(failed[i]), Source.IMPORT, int(steps[i]))
         elif verdict is None:
-            reason = MISSED.format("the first episode ends otherwise" if ends[i] else "no episode ends")
+            reason = MISSED.format("the first episode ends without it" if ends[i] else "no episode ends")
             verdict = untrained(Label.UNSOLVED, reason, bool(failed[i]))
         verdicts.append(verdict)
     return record, verdicts

@@ -58,7 +58,7 @@ class TrainedLevel(NamedTuple):
     """A level that has left its slot."""
 
     curve: list[float]  # per update: share of finished episodes that reached the goal; NaN: none finished
-    evaluations: list[Evaluation]  # those that solved the level, and the last
+    evaluations: list[Evaluation]  # evaluations that solved the level, and the last one
     expert: KeptExpert | None = None  # if kept
     candidates: Sequence[Witness] = ()  # possible witnesses, shortest first; some have been replayed
     evaluation_steps: int = 0  # env steps

@@ -23,8 +23,8 @@ from levelproof.levelgen.task.rules import TaskParams, TaskState
 from levelproof.physics.buffers import zeros_of
 from levelproof.physics.types import Manifold
 
-# Lanes of a block, which ends with its longest episode: of more lanes, most would wait for the last; fewer than the
-# engine's kernel steps together would not be faster
+# Lanes of a block, which ends with its longest episode. With more, most lanes would wait for the last one; with fewer
+# than the engine's kernel steps together, a block would be no faster
 SIDE_BY_SIDE = 16
 DISTANCE = "last_distance"
 

@@ -60,7 +60,7 @@ def replay(level: Level, action: ArrayLike, rules: TaskParams = DEFAULT_RULES) -
 
 
 def succeeds(done: ArrayLike, goal: ArrayLike) -> Bool[np.ndarray, "..."]:
-    """Return whether any episode ended and all that did reached the goal, from flags [time, ...]."""
+    """Return whether at least one episode ended and every one that ended reached the goal, from flags [time, ...]."""
     done, goal = np.asarray(done), np.asarray(goal)
     return np.asarray(done.any(0) & (goal | ~done).all(0))
 

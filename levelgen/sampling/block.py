@@ -43,7 +43,7 @@ GOAL_BODIES = 2  # green and blue come first
 
 
 class Filling(IntEnum):
-    """What to add at a body's turn after green, blue and the third body."""
+    """What to add at each turn after the first three bodies (green, blue and another)."""
 
     CONNECTED = 0
     FREE = 1
@@ -104,8 +104,8 @@ class Workspace(NamedTuple):
     draft: Draft
     order: NewOrder
     numbers: Float[Ref, "number lane"]  # all random numbers of a level, by `Layout`
-    chosen: Float[Ref, "draw lane"]  # those of the proposal with the fewest contacts so far
-    contacts: Float[Ref, " lane"]  # of that proposal
+    chosen: Float[Ref, "draw lane"]  # random numbers of the proposal with the fewest contacts so far
+    contacts: Float[Ref, " lane"]  # contacts of that proposal
 
 
 def scratch_of(size: Size, layout: Layout) -> Workspace:

@@ -1,8 +1,8 @@
 """The distribution of random levels: every number that the sampler uses.
 
-The defaults are the random-level distribution of the reference, Kinetix 3.0.2. Beside each field stands its source:
-[name] is a field of the reference's `UEDParams`; (module.function) of `kinetix.environment.ued` has the number in its
-code.
+The defaults are the random-level distribution of the reference, Kinetix 3.0.2. The comment on each field names its
+source: [name] is a field of the reference's `UEDParams`; (module.function) is the function of `kinetix.environment.ued`
+whose code contains the number.
 """
 
 import math
@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 from levelproof.levelgen.level import HALF_WORLD
 from levelproof.physics.bounds import require
 
-# m, of a free body from its centre: green and blue may each have to fit into one half of the world
+# m, from a free body's centre to its farthest point: green and blue may each have to fit into one half of the world
 MAX_REACH = HALF_WORLD / 2
 CONTROL_WEIGHTS = ("motor_only_weight", "thruster_only_weight", "motor_and_thruster_weight")
 
@@ -26,50 +26,50 @@ class Distribution:
         ValueError: a value is out of range; the message starts with the field's name.
     """
 
-    # The floor's role; plain otherwise
+    # The floor's role (plain otherwise)
     floor_green_chance: float = 0.0  # the floor is green [floor_prob_green]
     floor_blue_chance: float = 0.02  # the floor is blue [floor_prob_blue]
     floor_red_chance: float = 0.08  # the floor is red [floor_prob_red]
 
     # Shapes
     max_size: float = 1.0  # m, across a shape before lengthening [max_shape_size]
-    goal_size_factor: float = 1.0  # times max_size, for free green and blue bodies [goal_body_size_factor]
-    min_half_side: float = 0.05  # m, of a rectangle (util.sample_dimensions)
-    min_radius: float = 0.1  # m, of a circle (util.sample_dimensions)
-    circle_size_factor: float = 0.8  # times max_size, for circles [circle_max_size_coeff]
+    goal_size_factor: float = 1.0  # multiplies max_size for free green and blue bodies [goal_body_size_factor]
+    min_half_side: float = 0.05  # m, smallest half side of a rectangle (util.sample_dimensions)
+    min_radius: float = 0.1  # m, smallest radius of a circle (util.sample_dimensions)
+    circle_size_factor: float = 0.8  # multiplies max_size for circles [circle_max_size_coeff]
     long_side_chance: float = 0.3  # one side of a rectangle is lengthened [large_rect_dim_chance]
-    long_side_factor: float = 2.0  # times the length of that side [large_rect_dim_scale]
+    long_side_factor: float = 2.0  # multiplies the length of that side [large_rect_dim_scale]
 
     # Free bodies
     opposite_sides_chance: float = 0.5  # green starts left, blue right [goal_body_opposide_side_chance]
     fixed_chance: float = 0.02  # a body of mass 0 is fixed; heavier ones more often [fixate_chance_min]
-    fixed_chance_per_mass: float = 4.0  # 1/kg, times the mass, added to fixed_chance [fixate_chance_scale]
+    fixed_chance_per_mass: float = 4.0  # 1/kg; this times the mass is added to fixed_chance [fixate_chance_scale]
     max_fixed_chance: float = 1.0  # upper bound on the chance that a body is fixed [fixate_chance_max]
-    lowered_chance: float = 0.0  # a fixed body of the upper half moves to the lower [fixate_shape_bottom_bias]
-    goal_lowered_chance: float = 0.6  # added for green, blue, red [fixate_shape_bottom_bias_special_role]
-    red_weight: float = 1 / 3  # of a new red body, against 1 of a plain one, while the level has no red (util.get_role)
+    lowered_chance: float = 0.0  # a fixed body moves from the upper half to the lower [fixate_shape_bottom_bias]
+    goal_lowered_chance: float = 0.6  # added to lowered_chance if not plain [fixate_shape_bottom_bias_special_role]
+    red_weight: float = 1 / 3  # weight of red as a new body's role while none is red; that of plain: 1 (util.get_role)
 
-    # What must act; kinds that a size has no room for are left out (distributions.sample_kinetix_level)
-    motor_only_weight: float = 1.0  # of levels that require a motor
-    thruster_only_weight: float = 1.0  # of levels that require a thruster
-    motor_and_thruster_weight: float = 1.0  # of levels that require both
+    # Required actuators; kinds that a size has no room for are left out (distributions.sample_kinetix_level)
+    motor_only_weight: float = 1.0  # weight of levels that require a motor
+    thruster_only_weight: float = 1.0  # weight of levels that require a thruster
+    motor_and_thruster_weight: float = 1.0  # weight of levels that require both
 
     # Connected bodies
-    connected_circle_chance: float = 0.5  # a circle if both kinds fit (mutators.mutate_add_connected_shape)
-    fixed_target_weight: float = 0.05  # of a fixed body as a target; others: 1 [connect_to_fixated_prob_coeff]
-    polygon_connections: int = 2  # per polygon, exceeded only if all have them (mutators.mutate_add_connected_shape)
+    connected_circle_chance: float = 0.5  # a joined body is a circle if both fit (mutators.mutate_add_connected_shape)
+    fixed_target_weight: float = 0.05  # weight of a fixed body as partner; others: 1 [connect_to_fixated_prob_coeff]
+    polygon_connections: int = 2  # maximum joints per polygon until all are full (mutators.mutate_add_connected_shape)
     min_revolute_joints: int = 2  # no joint is fixed before this many are revolute [min_rjoints_bias]
-    fixed_joint_chance: float = 0.5  # a joint after these is fixed (mutators.mutate_add_connected_shape)
-    visible_margin: float = 0.05  # m, reach beyond the partner at some angle of the joint [connect_visibility_min]
-    hidden_penalty: float = 10.0  # contacts added to the count of a proposal that does not [connect_no_visibility_bias]
+    fixed_joint_chance: float = 0.5  # a joint after min_revolute_joints is fixed (mutators.mutate_add_connected_shape)
+    visible_margin: float = 0.05  # m that a body must reach beyond its partner at some angle [connect_visibility_min]
+    hidden_penalty: float = 10.0  # contacts added if a proposal misses visible_margin [connect_no_visibility_bias]
 
     # Motors
     motor_chance: float = 0.8  # a revolute joint's motor is on [motor_on_chance]
-    min_motor_speed: float = 0.4  # slowest, of task.physics.motor_speed [motor_min_speed]
-    max_motor_speed: float = 3.0  # fastest, of task.physics.motor_speed [motor_max_speed]
-    min_motor_power: float = 1.0  # weakest, of task.physics.motor_power [motor_min_power]
-    max_motor_power: float = 3.0  # strongest, of task.physics.motor_power [motor_max_power]
-    max_wheel_power: float = 1.0  # strongest at a circle: strong wheels destabilise the engine [wheel_max_power]
+    min_motor_speed: float = 0.4  # slowest, as a multiple of task.physics.motor_speed [motor_min_speed]
+    max_motor_speed: float = 3.0  # fastest, as a multiple of task.physics.motor_speed [motor_max_speed]
+    min_motor_power: float = 1.0  # weakest, as a multiple of task.physics.motor_power [motor_min_power]
+    max_motor_power: float = 3.0  # strongest, as a multiple of task.physics.motor_power [motor_max_power]
+    max_wheel_power: float = 1.0  # strongest if it drives a circle: stronger wheels are unstable [wheel_max_power]
     limit_chance: float = 0.4  # a revolute joint of two polygons has limits [joint_limit_chance]
     max_limit: float = math.pi  # rad, widest limit of a joint, to either side [joint_limit_max]
 
@@ -78,14 +78,14 @@ class Distribution:
     aligned_chance: float = 0.8  # a thruster points along the line through its body's centre [thruster_align_com_prob]
     min_thruster_power: float = 0.5  # weakest, per unit of mass (mutators.mutate_add_thruster)
     max_thruster_power: float = 2.0  # strongest, per unit of mass (mutators.mutate_add_thruster)
-    thruster_power_factor: float = 2.0  # times the power drawn between these two [thruster_power_multiplier]
+    thruster_power_factor: float = 2.0  # multiplies the drawn power [thruster_power_multiplier]
 
-    # Bodies after green, blue and the third one
-    connected_weight: float = 0.35  # of a body joined to another one [add_connected_shape_chance]
-    free_weight: float = 0.35  # of a body without a joint [add_shape_chance]
-    empty_weight: float = 0.3  # of no body [add_no_shape_chance]
+    # Each body after the first three (green, blue and another)
+    connected_weight: float = 0.35  # weight of adding a body joined to another [add_connected_shape_chance]
+    free_weight: float = 0.35  # weight of adding a body without a joint [add_shape_chance]
+    empty_weight: float = 0.3  # weight of adding none [add_no_shape_chance]
     proposals: int = 8  # proposals per body; the one with the fewest contacts is kept [add_shape_n_proposals]
-    small_world: int = 7  # bodies; up to this many: one proposal, no fixed bodies (distributions.sample_kinetix_level)
+    small_world: int = 7  # bodies; sizes up to this: one proposal, no fixed bodies (distributions.sample_kinetix_level)
 
     # Last
     swap_chance: float = 0.5  # green and blue change roles if the floor is plain (distributions.sample_kinetix_level)

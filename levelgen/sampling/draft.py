@@ -64,7 +64,7 @@ class Used(NamedTuple):
 class Notes(NamedTuple):
     """What later decisions need to know about the bodies so far."""
 
-    turn: Int[Ref, "body lane"]  # at which a body was added; NOBODY for the scenery
+    turn: Int[Ref, "body lane"]  # turn at which a body was added; NOBODY for the scenery
     group: Int[Ref, "body lane"]  # equal for bodies that a chain of joints holds together
     joints: Float[Ref, "body lane"]  # ends of joints at the body
     cos_sin: Float[Ref, "body 2 lane"]  # of the rotation

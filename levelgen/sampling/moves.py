@@ -145,8 +145,8 @@ def weigh_targets(draft: Draft, dist: Distribution) -> None:
 
     cumulate(notes.upper, 0, polygons, polygon)
     none_left = notes.upper[polygons - 1] == 0
-    anything = lambda i: jnp.where(none_left, 1.0 * (i < used.polygons[...]), polygon(i))
-    cumulate(notes.upper, 0, polygons, anything)
+    any_polygon = lambda i: jnp.where(none_left, 1.0 * (i < used.polygons[...]), polygon(i))
+    cumulate(notes.upper, 0, polygons, any_polygon)
     cumulate(notes.upper, polygons, bodies, circle)
 
 

@@ -26,7 +26,7 @@ from levelproof.levelgen.task.rules import TaskState
 class LevelTable:
     """Levels to start episodes in, or the levels that lanes play; level axis last."""
 
-    level: Level  # its constant arrays; `state` is None
+    level: Level  # the constant arrays of the level; `state` is None
     start: TaskState | None  # first state of an episode in each level; None for levels that lanes play
     features: Float[Array, "feature level"]  # constant part of the symbolic-flat observation; no rows for other types
 

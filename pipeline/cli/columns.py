@@ -16,21 +16,21 @@ EXAMPLE = "levelproof columns steps"
 INDENT = 26  # column at which meanings start
 INTRODUCTION = """# Columns
 
-Every column of a manifest, version {version}, which has one row for every level that was tried. They are the names \
-for `--where`, `--columns` and `--sort`, for `levelproof.open(where=...)`, and for every program that reads parquet. \
-`levelproof columns WORD` finds them on the command line. A rate or number that does not exist is null, never NaN, so \
-comparisons skip it.
+Every column of a manifest, version {version}, which has one row for every level that was tried. Use these names in \
+`--where`, `--columns` and `--sort`, in `levelproof.open(where=...)`, and in any program that reads parquet. \
+`levelproof columns WORD` searches them. A rate or number that does not exist is null, never NaN, so comparisons skip \
+it.
 
 | column | type, unit | meaning |
 |---|---|---|
 """
 END = """
-Version {oldest}, which had no {newer}, is read as well: there they are null. `seconds` is a struct, so SQL asks for \
-`seconds.training`, and `versions.jax` likewise.
+Manifests of version {oldest}, which had no {newer}, can be read, too: these columns are null there. `seconds` and \
+`versions` are structs: in SQL, write `seconds.training` and `versions.jax`.
 
-More on [labels](labels.md) and what they rest on, on [content hashes and signatures](levels.md), on \
-[portability](experts.md), on [seconds, shards and rows](storage.md). This page is written by `levelproof columns \
---markdown`, from `pipeline/store/columns.py`.
+More on [labels](labels.md) and their evidence, [content hashes and signatures](levels.md), \
+[portability](experts.md), and [seconds, shards and rows](storage.md). `levelproof columns --markdown` writes this \
+page, from `pipeline/store/columns.py`.
 """
 
 
@@ -45,17 +45,17 @@ def run(arguments: argparse.Namespace) -> None:
     from levelproof.pipeline.store.columns import DESCRIBED
 
     text = lambda column: f"{column.name} {column.type_name} {column.unit} {column.meaning}".lower()
-    found = [column for column in DESCRIBED if arguments.word.lower() in text(column)]
-    if not found:
+    matching = [column for column in DESCRIBED if arguments.word.lower() in text(column)]
+    if not matching:
         raise UserError(
             f"No column contains the word {arguments.word!r}: levelproof columns, without a word, lists all."
         )
     if arguments.json:
-        print(json.dumps([column._asdict() | {"type": column.type_name} for column in found], indent=2))
+        print(json.dumps([column._asdict() | {"type": column.type_name} for column in matching], indent=2))
     elif arguments.markdown:
         print(as_markdown(), end="")
     else:
-        print(*listed(map(_entry, found), shutil.get_terminal_size().columns, INDENT), sep="\n")
+        print(*listed(map(_entry, matching), shutil.get_terminal_size().columns, INDENT), sep="\n")
 
 
 def _entry(column: "ManifestColumn") -> tuple[str, str]:

@@ -9,8 +9,8 @@ SUMMARY = "make a split of seed files, with every witness replayed and checked"
 EXAMPLE = """\
 levelproof grow levels.parquet -o grown/256k/s
 levelproof grow seeds/256k/s -o grown/256k/s density=witness executor=inline"""
-SEEDS = "a seed file, from export --format seed, or a folder of some; path or URL"
-OUT = "the split to make or continue: FOLDER/BUDGET/SIZE, those of the seeds"
+SEEDS = "a seed file that `export --format seed` wrote, or a folder of them; path or URL"
+OUT = "the split to make or continue: FOLDER/BUDGET/SIZE, with the seeds' budget and size"
 SETTINGS = "density=, key_every=, executor= or workers=, as for generate"
 
 

@@ -8,7 +8,7 @@ from levelproof.pipeline.errors import Exit
 SUMMARY = "make a split of trajectories in Kinetix' format"
 EXAMPLE = "levelproof import kinetix/1M/s -o data/1M/s"
 FOLDER = "a zarr v2 group of trajectories, as in the released data or from export --format kinetix"
-OUT = "the split to make or continue: FOLDER/BUDGET/SIZE, where BUDGET is what the imported experts could use"
+OUT = "the split to make or continue: FOLDER/BUDGET/SIZE, where BUDGET is the budget of the imported experts"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -27,6 +27,6 @@ def run(arguments: argparse.Namespace) -> None:
 
     every = arguments.key_every
     if every is not None and arguments.density != "witness":
-        raise UserError("--key-every sets key frames, which only --density witness has: give both or neither.")
+        raise UserError("--key-every applies only to --density witness: add that, or leave --key-every out.")
     every = KEY_EVERY if every is None else every
     seal_split(arguments.split, arguments.rows, Console(stderr=True), arguments.density, every)

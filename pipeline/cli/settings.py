@@ -19,10 +19,10 @@ EXAMPLE = "levelproof settings thruster"
 INDENT = 34  # column at which meanings start
 INTRODUCTION = """# Settings
 
-Every setting of `levelproof generate`, with its default, as one types it: `levelproof generate size=m budget=64k`. \
-`levelproof settings WORD` finds them on the command line. Names in brackets and parentheses are where the reference, \
-Kinetix 3.0.2, has the number. This page is written by `levelproof settings --markdown`, from the comments beside the \
-fields of the dataclasses.
+Every setting of `levelproof generate` with its default, as typed on the command line: `levelproof generate size=m \
+budget=64k`. `levelproof settings WORD` searches them. A name in brackets or parentheses is the field or function of \
+the reference, Kinetix 3.0.2, that has the number. `levelproof settings --markdown` writes this page, from the \
+comments on the dataclasses' fields.
 """
 
 
@@ -37,17 +37,19 @@ def run(arguments: argparse.Namespace) -> None:
     from levelproof.configs.meanings import every_setting
 
     has_word = lambda text: arguments.word.lower() in text.lower()
-    found = [setting for setting in every_setting() if has_word(f"{setting.override} {setting.text} {setting.group}")]
-    if not found:
+    matching = [
+        setting for setting in every_setting() if has_word(f"{setting.override} {setting.text} {setting.group}")
+    ]
+    if not matching:
         raise UserError(
             f"No setting contains the word {arguments.word!r}: levelproof settings, without a word, lists all."
         )
     if arguments.json:
-        print(json.dumps([asdict(setting) for setting in found], indent=2))
+        print(json.dumps([asdict(setting) for setting in matching], indent=2))
     elif arguments.markdown:
-        print(as_markdown(found), end="")
+        print(as_markdown(matching), end="")
     else:
-        print(as_text(found, shutil.get_terminal_size().columns))
+        print(as_text(matching, shutil.get_terminal_size().columns))
 
 
 def as_text(settings: Iterable["Setting"], columns: int) -> str:

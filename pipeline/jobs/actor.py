@@ -29,7 +29,8 @@ class WorkerActor:
         if refusal := mismatch(program, job):
             return refusal
         prepare_jax(own_core(neighbours), job.device)
-        from levelproof.pipeline.jobs.ahead import Ahead  # their imports read JAX's settings, so they come after them
+        # These modules read JAX's settings on import, so import them after JAX is set up
+        from levelproof.pipeline.jobs.ahead import Ahead
         from levelproof.pipeline.jobs.workers import worker_for
 
         serve(split, writer)

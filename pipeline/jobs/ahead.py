@@ -1,4 +1,4 @@
-"""A job's programs, compiled before its levels come: each by one worker of a machine, those that take longest first."""
+"""Compiling a job's programs before its first level: one worker of a machine compiles each, the slowest one first."""
 
 import hashlib
 import time
@@ -21,8 +21,8 @@ DONE = b"compiled"  # content of the claim of a compiled program
 class Ahead:
     """The programs of a job, of which this process compiles those that no other process of this machine does.
 
-    Threads may share it: XLA compiles their programs side by side. Whatever needs a program that another process
-    compiles at this moment waits for it (`claims.share_compiling`).
+    Threads may share it: XLA compiles their programs side by side. A caller that needs a program which another process
+    is compiling waits for it (`claims.share_compiling`).
     """
 
     def __init__(self, job: JobConfig, pool: Pool) -> None:
@@ -30,7 +30,7 @@ class Ahead:
         search = job.search.scaled(size_of(job.size).bodies)
         of_code = [entry for entry in program_of(job).items() if entry[0] != "configuration"]
         settings = job.size, job.expert, search.endless, search.steady, job.task, of_code, device()
-        self._seconds: list[float] = []  # of each program that this process has compiled
+        self._seconds: list[float] = []  # time of each program that this process has compiled
         self._tracing = Lock()  # Python's part of compiling gains nothing from threads, and shares what it caches
         self._programs = {_claim(folder, program, repr(settings)): program for program in programs}
 
@@ -43,7 +43,7 @@ class Ahead:
             with suppress(OSError):  # a folder that cannot be written to, or has no locks: compile when needed
                 if not _is_done(path) and (file := try_claim(path)):
                     with file:
-                        if not _is_done(path):  # by now
+                        if not _is_done(path):  # another process may have compiled it by now
                             self._compile(program)
                             file.truncate(0)
                             file.write(DONE)

@@ -74,7 +74,7 @@ class WorkerHandle:
 
     @property
     def free(self) -> bool:
-        """Whether it can take an order now."""
+        """Whether the worker can take an order now."""
         return self.up and self.answer is None
 
     def start(self, name: str, gpus: int, *begin: Any) -> None:
@@ -96,17 +96,17 @@ def _reason(error: RayError) -> str:
     """Return Ray's reason for a worker's death, as a sentence without its full stop."""
     lines = str(error).strip().splitlines()
     if isinstance(error, ActorDiedError):
-        return lines[-1] if error.actor_init_failed else "The worker died; if memory ran out, `dmesg` says so"
+        return lines[-1] if error.actor_init_failed else "The worker died; if memory ran out, `dmesg` shows it"
     return f"The worker died: {lines[0].rstrip('.')}"
 
 
 def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board: Board, stop: Stop) -> None:
-    """Run all units on Ray workers, or until `stop` is asked for.
+    """Run all units on Ray workers, or until a stop is requested.
 
     Raises:
         UserError: the cluster of RAY_ADDRESS cannot be reached.
         Failure: no worker can start.
-        KeyboardInterrupt: `stop` was asked for; workers have committed what they could.
+        KeyboardInterrupt: a stop was requested; workers have committed all levels that were decided.
     """
     with connected(), stop.heeded():  # in this order: Ray sets a handler of its own when it starts
         crew = Crew(with_absolute_paths(job), absolute(split), scheduler, board, served(split))
@@ -126,7 +126,7 @@ class Crew:
     """All workers of a job: one for each core or GPU of each machine."""
 
     def __init__(self, job: JobConfig, split: Path, scheduler: Scheduler, board: Board, writer: str = "") -> None:
-        """`writer` names the split's writer, for whom workers commit (see `leases.serve`); empty: there is none."""
+        """Plan the workers; `writer` names the writer for which they commit (see `leases.serve`), or is empty."""
         if why := _why_no_gpu() if job.device == "gpu" else "":
             board.say(f"Workers use CPU cores, not GPUs: {why}.")
         self._gpus = job.device == "gpu" and not why

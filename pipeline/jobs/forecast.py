@@ -31,12 +31,12 @@ class PerWitness(NamedTuple):
 
 @dataclass(frozen=True)
 class Sample:
-    """Measurements of some levels."""
+    """Measurements of a job's first levels, from which the rest is estimated."""
 
     device: str  # core or GPU
     workers: int
     wall: float  # s, of the whole measurement
-    once: float  # s that any run takes: to start, to load programs, to wait for the last levels
+    once: float  # s that every run spends, however short: starting, loading programs, waiting for the last levels
     compiling: float  # s of a worker with an empty cache
     busy: Float[np.ndarray, " level"]  # s of a worker, without compiling and idle slots
     solved: Bool[np.ndarray, " level"]

@@ -82,7 +82,7 @@ def generate(
             _tidy(split, manifest, tell)
             spent = _spent(manifest, np.setdiff1d(wanted, done), tally.spent) if tally.spent.shown else ""
         else:
-            print(f"Nothing to do: {many(len(wanted), 'level')} there already.")
+            print(f"Nothing to do: the split already has {many(len(wanted), 'level')}.")
         _closing(split, manifest, wanted, scheduler.quarantined, spent)
     return Exit.QUARANTINED if scheduler.quarantined else Exit.DONE
 
@@ -140,7 +140,7 @@ def _make(
     count, there = many(len(wanted), "level"), int(is_done.sum())
     tally = Tally(len(wanted), there, manifest.counts(is_done).get(Label.SOLVED, 0))
     board = Board(tally, console)
-    already = f", {there} are there already" if there else ""
+    already = f", {there} are already there" if there else ""
     board.say(f"{count} of size {job.size}, {job.origin}, into {as_typed(split)}{already}")
     try:
         with (

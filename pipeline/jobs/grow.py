@@ -41,11 +41,11 @@ def grow(source: Path, out: Path, settings: Sequence[str], console: Console) -> 
     """
     if wrong := [setting for setting in settings if setting.partition("=")[0] not in SETTINGS]:
         raise UserError(
-            f"{wrong[0]} cannot be set here, the seeds decide it: leave it out; {', '.join(SETTINGS)} may change."
+            f"{wrong[0]} cannot be set, because the seeds decide it: leave it out. Only {', '.join(SETTINGS)} can."
         )
     if not is_seed(source):
         raise UserError(
-            f"There is no seed file at {as_typed(source)}: give a file that `levelproof export SPLIT --format seed` "
+            f"There is no seed file at {as_typed(source)}: name a file that `levelproof export SPLIT --format seed` "
             "wrote, or a folder of some."
         )
     manifest = require_manifest(source, [])
@@ -64,7 +64,7 @@ def _job(source: Path, out: Path, settings: Sequence[str], config: dict) -> Grow
     path = out if is_remote(out) else out.expanduser().absolute()
     if (path.parent.name, path.name) != (budget, size):
         raise UserError(
-            f"The seeds have size {size} and budget {budget}, and the split would be {out}: name it so, as in "
+            f"The seeds have size {size} and budget {budget}, which the name of the split {out} must end in: use "
             f"-o data/{budget}/{size}."
         )
     chosen = compose_job(settings)
@@ -91,8 +91,8 @@ def _report(source: Path, split: Path, wanted: np.ndarray, console: Console) -> 
         levels = levels_text([WorkUnit(tuple(left_out.tolist()))])
         say(
             console,
-            f"Left out: {many(len(left_out), 'level')}, whose first episodes differ here from what the "
-            f"seeds say of them ({levels}).",
+            f"Left out: {many(len(left_out), 'level')}, whose first episodes on this machine differ from those in "
+            f"the seeds ({levels}).",
         )
     drifted = 0
     for path in seed_files(source):
@@ -105,7 +105,7 @@ def _report(source: Path, split: Path, wanted: np.ndarray, console: Console) -> 
                 drifted += content_digest(hashes.to_pylist()) != digest
     if drifted:
         raise Failure(
-            f"The sampler made other levels here than those that {as_typed(source)} was exported from, in "
-            f"{many(drifted, 'row group')}: use the levelproof that wrote it."
+            f"In {many(drifted, 'row group')}, this sampler makes other levels than those that {as_typed(source)} was "
+            "exported from: use the levelproof that wrote it."
         )
     return Exit.FAILED if len(left_out) else Exit.DONE

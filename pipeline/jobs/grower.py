@@ -72,9 +72,9 @@ def grow_unit(job: GrowConfig, split: Path, unit: WorkUnit) -> tuple[int, int, i
     good, arrays = np.zeros(0, int), {}
     if len(played):
         parts, places = parts_of(source, table.take(played))
-        found = parts[0][0].restore(parts, table_for(size_of(job.size)), places)
-        good = np.flatnonzero(found.unlike < 0)
-        arrays = {name: np.moveaxis(x[good], 0, -1) for name, x in found.arrays.items()}
+        simulated = parts[0][0].restore(parts, table_for(size_of(job.size)), places)
+        good = np.flatnonzero(simulated.unlike < 0)
+        arrays = {name: np.moveaxis(x[good], 0, -1) for name, x in simulated.arrays.items()}
     kept = np.setdiff1d(np.arange(table.num_rows), np.delete(played, good))
     if len(kept):
         _commit(job, split, left, table.take(kept), arrays)

@@ -74,7 +74,7 @@ def import_folder(folder: Path, out: Path, console: Console) -> Exit:
         _require_same_folder(source, parts, split)
         note_job(split, job, command, [(0, source.rows - 1)])
         done = len(parts) - len(left)
-        already = f", {done} of {len(parts)} units are there already" if done else ""
+        already = f", {done} of {len(parts)} units are already there" if done else ""
         say(console, f"{many(source.rows, 'trajectory')} of size {job.size} into {split}{already}")
         skipped: Counter[str] = Counter()  # number of records by reason
         shown = track(left, "units of trajectories", console=console, transient=True, disable=not console.is_terminal)
@@ -101,14 +101,16 @@ def _job(folder: Folder, out: Path) -> ImportConfig:
     """Return the job that imports a folder; raise UserError if `out` does not end in a budget and the right size."""
     size, absolute = name_of(folder.size), out.expanduser().absolute()
     parent = out.parent.parent if len(out.parts) > 1 else absolute.parent.parent
-    example = f"name the split so, as in -o data/1M/{size}"
+    example = f"name the split by its budget and size, as in -o data/1M/{size}"
     if absolute.name != size:
-        raise UserError(f"{folder.path} has levels of size {size}, and the split would be {out}: {example}.")
+        raise UserError(f"{folder.path} has levels of size {size}, but the split is named {out}: {example}.")
     try:
         return ImportConfig(size=size, budget=absolute.parent.name, out=str(parent), level_files=str(folder.path))
     except ValueError as error:
         reason = str(error).rstrip(".")
-        raise UserError(f"Cannot make the split {out} ({reason}): {example}, with the budget that was used.") from None
+        raise UserError(
+            f"Cannot make the split {out} ({reason}): {example}, with the budget of the imported experts."
+        ) from None
 
 
 def _parts(folder: Folder) -> Iterator[UnitOfRows]:

@@ -16,16 +16,17 @@ if TYPE_CHECKING:
 
 HERE = "this process"
 POLL = 0.25  # s between progress updates while programs compile
-MAX_THREADS = 6  # of compiling; one at a time traces, which takes a fifth of the time
-MANY = 16  # levels that use nearly all programs of a job, so that none compiles in vain
+MAX_THREADS = 6  # threads that compile; one at a time traces, which takes a fifth of the time
+MANY = 16  # levels; a job of fewer may compile programs that it does not use
 
 
 def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board: Board, stop: Stop) -> None:
-    """Run all units in this process, or until `stop` is asked for."""
+    """Run all units in this process, or until a stop is requested."""
     prepare_jax(device=job.device)
     if job.device == "gpu" and not jax_sees_a_gpu():
         board.say(f"This process uses a CPU core, not a GPU: {NO_GPU}.")
-    from levelproof.pipeline.jobs.ahead import Ahead  # their imports read JAX's settings, so they come after them
+    # These modules read JAX's settings on import, so import them after JAX is set up
+    from levelproof.pipeline.jobs.ahead import Ahead
     from levelproof.pipeline.jobs.workers import worker_for
 
     with stop.heeded():

@@ -12,7 +12,7 @@ Machine = Mapping[str, Any]  # a machine's entry in Ray's list of nodes
 GB = 10**9  # bytes
 # Largest number of bodies, and bytes of a worker. Compiling takes the most: measured 1.35 GB for s and 1.64 for l
 BYTES = ((SIZES["s"].bodies, 1.5 * GB), (SIZES["l"].bodies, 1.8 * GB))
-MAX_BYTES = 2.5 * GB  # of a worker for larger sizes; an estimate
+MAX_BYTES = 2.5 * GB  # memory of a worker for larger sizes; an estimate
 
 
 def bytes_of_worker(size: Size) -> int:
@@ -26,7 +26,7 @@ def workers_by_machine(machines: Mapping[str, Machine], kind: str, most: int, me
     Each worker has its own core or GPU (`kind`, "CPU" or "GPU") and `memory` bytes. A machine with too little memory
     for one worker still gets one.
     """
-    count = {name: min(_units(of, kind), max(1, _fit(of, memory))) for name, of in machines.items()}
+    count = {name: min(_units(machine, kind), max(1, _fit(machine, memory))) for name, machine in machines.items()}
     turns = sorted((turn, name) for name, number in count.items() for turn in range(number))  # one on each, then more
     return Counter(name for _, name in turns[:most])
 

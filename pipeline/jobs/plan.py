@@ -57,7 +57,7 @@ def plan(job: JobConfig, as_json: bool, console: Console) -> None:
 
 
 def report_lines(job: JobConfig, sample: Sample, cost: Forecast) -> list[str]:
-    """Return the forecast as lines for people."""
+    """Return the forecast as lines for the terminal."""
     scale, unit = next((one for one in UNITS if cost.wall.expected > 1.5 * one[0]), UNITS[-1])
     per_solved = cost.seconds_per_solved
     lines = {
@@ -139,7 +139,7 @@ def costs_of(split: Path) -> tuple[pa.Table, np.ndarray, np.ndarray]:
     table = read_manifest(split).table
     if not table.num_rows:
         raise Failure(
-            "None of the levels could be made here: run `levelproof generate` with these settings to see why."
+            "No level could be made on this machine: run `levelproof generate` with these settings to see why."
         )
     column = table.column("seconds")
     cost = Seconds(*(pc.struct_field(column, stage).to_numpy().astype(float) for stage in Seconds._fields))  # pyright: ignore[reportAttributeAccessIssue]

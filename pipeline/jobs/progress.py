@@ -28,8 +28,8 @@ class Tally:
     done: int  # committed, including those of earlier runs
     solved: int
     running: dict[WorkUnit, tuple[int, float, int]] = field(default_factory=dict)  # env steps, levels, solved
-    spent: EnvSteps = field(default_factory=EnvSteps)  # on this run's committed units
-    seconds: Seconds = NO_SECONDS  # of workers, on the same units
+    spent: EnvSteps = field(default_factory=EnvSteps)  # env steps spent on this run's committed units
+    seconds: Seconds = NO_SECONDS  # workers' time on the same units
     compiled: tuple[int, int] = (0, 0)  # programs that workers have compiled before they begin, and all of them
 
     def follow(self, round: Round) -> None:

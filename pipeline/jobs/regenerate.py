@@ -63,12 +63,12 @@ def split_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]
     values = {name: value for name, _, value in (argument.partition("=") for argument in arguments)}
     own = {name: values[name] for name in OWN if name in values}
     if "manifest" not in own:
-        raise UserError(f"Which levels? Name the split they are in, {HINT}.")
+        raise UserError(f"The manifest is missing: name the split of the levels, {HINT}.")
     if "budget" not in values:
-        raise UserError(f"Which budget? Give one, {HINT}.")
+        raise UserError(f"The budget is missing: set it, {HINT}.")
     for name in FIXED:
         if any(key.partition(".")[0] == name for key in values):
-            raise UserError(f"{name} cannot be changed here, the manifest decides it: choose levels with where=SQL.")
+            raise UserError(f"{name} cannot be changed, because the manifest decides it: choose levels with where=SQL.")
     if own.get("continue", "false") not in ("true", "false"):
         raise UserError(f"continue is {own['continue']}: it must be true or false.")
     return own, [argument for argument in arguments if argument.partition("=")[0] not in OWN]

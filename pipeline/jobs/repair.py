@@ -140,7 +140,7 @@ def _budget(split: Path, env_steps: int) -> str:
 
 
 def _not_regenerated(findings: Findings) -> list[str]:
-    """Return sentences on the levels that cannot be regenerated here."""
+    """Return sentences that name the levels which this machine cannot regenerate, and why."""
     sentences = []
     for reason in dict.fromkeys(findings.unrepairable.values()):
         ids = [level_id for level_id, why in findings.unrepairable.items() if why == reason]
@@ -152,7 +152,7 @@ def _not_regenerated(findings: Findings) -> list[str]:
 
 
 def _note(split: Path, job: JobConfig, findings: Findings) -> None:
-    """Add the lost levels to those that the split wants, before any data is deleted: a later run then makes them."""
+    """Note the lost levels as ordered before any data is deleted, so that a later run makes them."""
     note = sound_note(split)
     wanted = note.level_ids.tolist() if note else findings.present
     note_job(split, job, _command(split), merged(wanted, runs(sorted(findings.lost))))

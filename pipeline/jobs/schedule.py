@@ -117,7 +117,7 @@ Settle = Callable[[Sequence[UnitOutcome]], None]  # accounts for attempts that e
 class Cut(NamedTuple):
     """A unit from which a worker has given levels back."""
 
-    unit: WorkUnit  # before the cut
+    unit: WorkUnit  # the unit before the cut
     kept: WorkUnit | None  # continues on the worker
     back: WorkUnit | None  # returns to the scheduler
 
@@ -138,7 +138,7 @@ class Round:
 class Order:
     """The driver's instructions for a worker's next round."""
 
-    units: list[WorkUnit]  # to begin
+    units: list[WorkUnit]  # units to begin
     give: int = 0  # unstarted levels to give back
 
 
@@ -146,12 +146,12 @@ class Order:
 class Assignment:
     """The units of one worker, and what it last reported."""
 
-    units: dict[WorkUnit, None] = field(default_factory=dict)  # in the order in which it got them
+    units: dict[WorkUnit, None] = field(default_factory=dict)  # in the order in which the worker got them
     wants: int = 1  # further levels for which it has room
     spare: int = 0  # unstarted levels
     asked: int = 0  # levels to give back
     heard: float = 0.0  # s, time of the last order or report
-    slowness: float | None = None  # its time per level divided by other workers'; None: it has ended no unit
+    slowness: float | None = None  # the worker's time per level, divided by other workers'; None: it has ended no unit
 
 
 class Scheduler:
@@ -240,10 +240,11 @@ class Scheduler:
         return [UnitOutcome(unit, reason=reason) for unit in self._remove(worker)]
 
     def failed(self, unit: WorkUnit) -> bool:
-        """Count a failed attempt; return whether the unit is now quarantined, else it waits again.
+        """Count a failed attempt; return whether the unit is now quarantined. If not, it waits for another attempt.
 
-        It stays whole, so that an attempt finds what an earlier one has committed. Only the last attempt is made at
-        parts no larger than untimed units, so that a level that always fails takes few others into quarantine.
+        The unit stays whole, so that an attempt finds the levels that an earlier one committed. Only for the last
+        attempt it is split into parts no larger than untimed units, so that a level that always fails takes few others
+        into quarantine.
         """
         self.attempts[unit] = attempts = self.attempts.get(unit, 0) + 1
         if attempts == len(MAX_UNITS):
@@ -333,10 +334,13 @@ def schedule(
     timed: bool,
     origins: Mapping[int, Origin] | None = None,
 ) -> Scheduler:
-    """Return a scheduler of the `levels` levels that are wanted and not done; `unit` and `timed` as in `Scheduler`."""
+    """Return a scheduler of those `wanted` levels, `levels` in number, that are not done.
+
+    `Scheduler` documents `unit` and `timed`.
+    """
     return Scheduler(plan_units(wanted, done, STRETCH if timed else unit, origins), levels, unit, timed)
 
 
 def levels_text(units: Iterable[WorkUnit]) -> str:
-    """Describe the levels of units for people: `levels 0 to 31, 96 to 127`."""
+    """Describe the levels of units for messages: `levels 0 to 31, 96 to 127`."""
     return runs_text(runs([level_id for unit in units for level_id in unit.level_ids]))

@@ -60,7 +60,9 @@ def seal_split(
         groups = store.plan(pieces, rows or store.ROWS)
         if wanted:
             others = {fragment.path for fragment in manifest.counting if fragment.densities != {stored_as(*wanted)}}
-            groups += [[piece] for piece in pieces if piece.path in others and not any(piece in of for of in groups)]
+            groups += [
+                [piece] for piece in pieces if piece.path in others and not any(piece in planned for planned in groups)
+            ]
         columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
         with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
             task = bar.add_task("levels sealed", total=sum(piece.rows for group in groups for piece in group))

@@ -98,7 +98,7 @@ def check_witnesses(result: UnitResult, task: TaskParams) -> None:
     """Check that every witness, replayed from its level and actions, reproduces its record and reaches the goal.
 
     Raises:
-        Failure: a witness does not.
+        Failure: a witness does not reproduce its record or reach the goal.
     """
     replayed = replay(result.levels, result.record.action, task)
     wrong, reached = unlike_fields(result.record, replayed), succeeds(replayed.done, replayed.goal)

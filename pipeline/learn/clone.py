@@ -83,10 +83,10 @@ def clone(splits: Sequence[Path], config: CloneConfig, out: Path, console: Conso
 
 
 def source_of(split: Path, config: CloneConfig, tell: Callable[[str], None]) -> PartedSplit:
-    """Open a split, and part its levels; leave out copies of sealed levels, and say so.
+    """Open a split and divide its levels into training and validation; report and leave out copies of sealed levels.
 
     Raises:
-        UserError: the split is unusable, has sealed ids, or too few levels that are no copies.
+        UserError: the split is unusable, has sealed ids, or too few levels besides copies.
     """
     data = Dataset(split, config.where or None, (), config.validation)
     ids = data.manifest["level_id"].to_numpy()
@@ -96,7 +96,9 @@ def source_of(split: Path, config: CloneConfig, tell: Callable[[str], None]) -> 
     usable = np.array([content_hash not in sealed for content_hash in hashes])
     copies = int((~usable).sum())
     if copies:
-        tell(f"{split}: {many(copies, 'level')} left out, with the content of sealed levels, which measure policies.")
+        tell(
+            f"{split}: {many(copies, 'level')} left out: copies of sealed levels, which only serve to measure policies."
+        )
     train, kept = (np.flatnonzero(usable & in_subset(hashes, part, config.validation)) for part in (TRAIN, VALIDATION))
     if not len(train) or not len(kept):
         count = len(data) - copies

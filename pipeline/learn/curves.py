@@ -26,7 +26,7 @@ class Curves(NamedTuple):
     """What a kind of run draws."""
 
     step: str  # the metric that the others are plotted over
-    unit: str  # of it
+    unit: str  # unit of the step
     panels: Sequence[Panel]
     names: Mapping[Colour, str]  # of the colours
 

@@ -114,7 +114,7 @@ def _groups(
     if any(starts):
         if is_named(on) or not is_split(Path(on)):
             raise UserError(
-                f"--start plays from states of a split's witnesses, and {on} is no split: name one with --on."
+                f"--start plays from states of a split's witnesses, but {on} is not a split: name one with --on."
             )
         for start in starts:
             yield midway_levels(Path(on), where, count, start)
@@ -130,7 +130,7 @@ def _groups(
 class _Entrant(NamedTuple):
     player: Player
     params: Any = ()
-    chance: bool = True  # whether attempts differ
+    chance: bool = True  # whether attempts differ by random draws
 
 
 def _entrants(policy: Policy | None) -> dict[str, _Entrant]:

@@ -1,7 +1,7 @@
 """The log of looks at the sealed levels, beside the policy that was measured.
 
-Who chooses among policies by their sealed solve rates has trained on the sealed levels, so whoever publishes a policy
-should say how often it was measured on them.
+To choose among policies by their sealed solve rates is to train on the sealed levels, so a published policy should say
+how often it was measured on them.
 """
 
 import json

@@ -26,19 +26,19 @@ from levelproof.pipeline.store.manifest import fragment_paths, require_manifest
 from levelproof.pipeline.store.remote import is_remote
 from levelproof.pipeline.store.seed.file import is_seed
 
-AT_ONCE = 256  # witnesses that are read together
+AT_ONCE = 256  # witnesses per read
 
 
 class MeasuredLevels(NamedTuple):
-    """Levels of one size."""
+    """Levels of one size on which policies are measured."""
 
-    name: str  # for people
+    name: str  # as shown to users
     level_ids: Int[np.ndarray, " level"]
     levels: Level  # on the host, level axis last
     rules: TaskParams
     solved: Bool[np.ndarray, " level"] | None  # whether they are labelled solved; None: they have no labels
-    start: float = 0.0  # where in their witnesses attempts start, as a share of the steps to the goal
-    published: Mapping[str, float] = MappingProxyType({})  # solve rates by agent that others published for them
+    start: float = 0.0  # step of a witness from whose state attempts start, as a share of its steps to the goal
+    published: Mapping[str, float] = MappingProxyType({})  # published solve rates on these levels, by agent
 
     def first(self, count: int | None) -> "MeasuredLevels":
         """Return the first `count` levels; None: all."""
@@ -85,7 +85,7 @@ def levels_in(
         yield _of_split(place, where, count)
         return
     if where is not None:
-        raise UserError(f"--where selects levels of a split, and {place} is none: leave it out.")
+        raise UserError(f"--where selects levels of a split, but {place} is not a split: leave --where out.")
     try:
         listing = levels_below(place, JobConfig())
     except UserError:

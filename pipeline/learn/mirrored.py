@@ -31,7 +31,7 @@ def mirrored(batch: Batch, names: Sequence[str], whole: bool, rules: TaskParams)
     Args:
         batch: whole records with their levels.
         names: fields of states to return, such as `record/state/position`.
-        whole: whether every episode of a record has to reach the goal, or only the first.
+        whole: whether every episode of a record must reach the goal, or only the first.
         rules: the task's rules.
     """
     image = mirror(jax.tree.map(lambda x: np.moveaxis(x, 0, -1), batch.level))

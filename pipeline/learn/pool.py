@@ -134,7 +134,7 @@ class Feed:
     def _read(self, turn: int) -> list[LevelPool]:
         pools = []
         for source, order in zip(self._sources, self._orders, strict=True):
-            items, _ = order.items(turn)  # an epoch's last round is filled up with levels of the next one's first
+            items, _ = order.items(turn)  # an epoch's last round is padded with levels of the next epoch's first round
             pools.append(read_pool(source.data, source.train[items], self._config, self._follow))
         return pools
 

@@ -27,7 +27,7 @@ from levelproof.pipeline.runtime import cache_folder
 PACKAGE = "kinetix-env==3.0.2"
 HANDMADE, RANDOM = "handmade", "reference-random"
 HANDMADE_LEVELS = {"s": 10, "m": 24, "l": 40}
-RANDOM_LEVELS = 512  # of a size
+RANDOM_LEVELS = 512  # levels per size
 
 
 class Protocol(NamedTuple):
@@ -89,11 +89,11 @@ def handmade_folder(say: Callable[[str], None] = print) -> Path:
     folder.parent.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent) as temporary:
         _fetch(Path(temporary))
-        found = Path(temporary) / "kinetix" / "levels"
-        if not _is_whole(found):
+        unpacked = Path(temporary) / "kinetix" / "levels"
+        if not _is_whole(unpacked):
             raise Failure(f"The package {PACKAGE} does not have the handmade levels that it should have.")
         shutil.rmtree(folder, ignore_errors=True)
-        found.rename(folder)
+        unpacked.rename(folder)
     return folder
 
 
@@ -115,8 +115,8 @@ def _fetch(folder: Path) -> None:
             return
         reasons.append((done.stderr.strip().splitlines() or ["no message"])[-1])
     raise UserError(
-        f"Cannot fetch the handmade levels ({'; '.join(reasons)}): get `pip download --no-deps {PACKAGE}` elsewhere, "
-        "unzip the file, and name its folder with --on kinetix/levels."
+        f"Cannot fetch the handmade levels ({'; '.join(reasons)}): run `pip download --no-deps {PACKAGE}` on another "
+        "machine, unzip the file, and name its folder with --on kinetix/levels."
     )
 
 

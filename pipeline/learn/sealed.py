@@ -22,11 +22,11 @@ from levelproof.pipeline.runtime import cache_folder
 from levelproof.pipeline.store.files import write
 from levelproof.pipeline.words import many
 
-SEALED = range(2_000_000_000, 2_000_002_048)  # their ids
+SEALED = range(2_000_000_000, 2_000_002_048)  # ids of the sealed levels
 HASH = re.compile(rf"c{VERSION}:[0-9a-f]{{{DIGITS}}}")
 KNOWN = "sealed.json"  # made by manifests/make_sealed.py
 LETTERS = {Label.SOLVED: "s", Label.TRIVIAL: "t", Label.UNSOLVABLE: "x", Label.UNSOLVED: "u"}
-SUCCESSES = "0123456789abcdefg"  # of 16 attempts
+SUCCESSES = "0123456789abcdefg"  # one character per level: successes in 16 attempts
 
 
 class KnownSealed(NamedTuple):

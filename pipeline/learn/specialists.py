@@ -13,13 +13,13 @@ from levelproof.pipeline.learn.sealed import known_sealed
 from levelproof.pipeline.learn.solve_rates import Solved
 from levelproof.pipeline.store.manifest import require_manifest
 
-ATTEMPTS = 16  # by which splits rate an expert if their configuration does not say
+ATTEMPTS = 16  # attempts per expert in splits whose configuration does not say
 
 
 class Specialists(NamedTuple):
     """The experts of a split."""
 
-    name: str  # for people
+    name: str  # as shown to users
     solved: Solved  # first episodes with sampled actions; an expert that was not needed or found nothing has none
 
 

@@ -49,7 +49,7 @@ COURSE = Curves(
     ),
     {GREEN: "solve rate", BLUE: "entropy"},
 )
-WITHOUT_EFFECT = ("log", "cores")  # settings that a continued run may change; the number of cores is kept apart
+WITHOUT_EFFECT = ("log", "cores")  # settings that a resumed run may change; the number of cores is noted separately
 
 
 def train(config: TrainConfig, out: Path, console: Console) -> None:
@@ -100,7 +100,7 @@ def prepared_cores(config: TrainConfig, note: dict[str, Any] | None) -> int:
     """Set JAX up, and return how many devices share the lanes: as many as before if the run continues.
 
     Raises:
-        UserError: JAX does not show so many.
+        UserError: JAX has fewer devices than that.
     """
     wanted = int(note["cores"]) if note and "cores" in note else config.cores
     even = next((cores for cores in range(len(own_cores()), 1, -1) if config.ppo.shares_out(cores)), 1)
@@ -114,7 +114,7 @@ def prepared_cores(config: TrainConfig, note: dict[str, Any] | None) -> int:
 
 
 def recipe_of(config: TrainConfig, source: TrainingLevels, start: Policy | None, cores: int) -> TrainingRecipe:
-    """Return what decides the programs. Raise UserError if the lanes do not share out over the cores."""
+    """Return what decides the programs. Raise UserError if the cores do not divide the lanes evenly."""
     try:
         config.ppo.chunk(cores)
     except ValueError as error:

@@ -23,14 +23,14 @@ from levelproof.pipeline.words import many
 class TrainingLevels(NamedTuple):
     """Levels of one size."""
 
-    name: str  # for people
+    name: str  # as shown to users
     levels: Level | Sampler
     rules: TaskParams
     facts: dict[str, Any]  # what identifies them, as JSON
 
 
 def levels_for(config: TrainConfig, tell: Callable[[str], None]) -> TrainingLevels:
-    """Return the levels that the settings name; leave out copies of sealed levels, and say so.
+    """Return the levels that the settings name; leave out copies of sealed levels, with a notice.
 
     Raises:
         UserError: there are none, or of several sizes, or sealed ones.
@@ -52,9 +52,13 @@ def levels_for(config: TrainConfig, tell: Callable[[str], None]) -> TrainingLeve
     sealed, hashes = sealed_hashes(group.levels.size), content_hashes(group.levels)
     usable = np.array([each not in sealed for each in hashes])
     if copies := int((~usable).sum()):
-        tell(f"{place}: {many(copies, 'level')} left out, with the content of sealed levels, which measure policies.")
+        tell(
+            f"{place}: {many(copies, 'level')} left out: copies of sealed levels, which only serve to measure policies."
+        )
     if not usable.any():
-        raise UserError(f"{place} has no level but copies of sealed ones, which measure policies: choose others.")
+        raise UserError(
+            f"{place} has only copies of sealed levels, which only serve to measure policies: choose others."
+        )
     levels = jax.device_put(take(group.levels, np.flatnonzero(usable)))
     facts = {"levels": str(place), "count": len(levels), "ids": group.level_ids[usable].tolist()}
     return TrainingLevels(str(place), levels, group.rules, facts)

@@ -175,10 +175,10 @@ def _print(facts: dict[str, Any], console: Console) -> None:
     console.print(table)
     say = lambda text: console.print(text, soft_wrap=not console.is_terminal)
     say("")
-    alone = [
+    one_sided = [
         f"{count:,} only in {split}" for count, split in zip(facts["alone"], facts["splits"], strict=True) if count
     ]
-    say(f"{facts['levels']:,} levels are in both" + (f" ({', '.join(alone)})." if alone else "."))
+    say(f"{facts['levels']:,} levels are in both" + (f" ({', '.join(one_sided)})." if one_sided else "."))
     say(f"Settings that differ: {changes_text(facts['settings']) or 'none'}.")
     for name, unit in (("env_steps", "env steps"), ("seconds", "seconds")):
         if (more := facts[f"{name}_for_one_more"]) is not None:

@@ -87,8 +87,8 @@ def _repeated(values: np.ndarray) -> np.ndarray:
     """Mask of the values that occur more than once."""
     ordered = np.sort(values)  # `argsort` would take four times as long
     twice = ordered[1:][ordered[1:] == ordered[:-1]]
-    found = pc.is_in(pa.array(values), pa.array(twice))  # pyright: ignore[reportAttributeAccessIssue]
-    return found.to_numpy(zero_copy_only=False)
+    repeated = pc.is_in(pa.array(values), pa.array(twice))  # pyright: ignore[reportAttributeAccessIssue]
+    return repeated.to_numpy(zero_copy_only=False)
 
 
 def hash_strings(strings: pa.ChunkedArray) -> np.ndarray:
@@ -144,10 +144,10 @@ def between(levels: pa.Table, others: pa.Table, shown: int) -> Duplicates:
         return {name: _pairs(connection, query, shown) for name, query in queries.items()}
 
 
-def describe(found: Duplicates) -> str:
+def describe(duplicates: Duplicates) -> str:
     """Describe in words: counts, and the first pair of each kind."""
     words = []
-    for kind, entry in found.items():
+    for kind, entry in duplicates.items():
         example = " (such as {} and {})".format(*entry["pairs"][0]) if entry["pairs"] else ""
         words.append(f"{entry['levels']:,} {kind}{example}")
     return ", ".join(words)

@@ -39,7 +39,7 @@ class Share(NamedTuple):
 
     @property
     def rounded(self) -> list[float]:
-        """The interval, rounded for people and JSON."""
+        """The interval, rounded for display and JSON."""
         return [round(end, 4) for end in self.interval]
 
     def __str__(self) -> str:

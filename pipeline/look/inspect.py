@@ -133,5 +133,5 @@ def _quantiles(table: pa.Table, column: str) -> dict[str, float] | None:
     values = table.column(column).drop_null().to_numpy()
     if not len(values):
         return None
-    found = np.quantile(values, QUANTILES, method="nearest").tolist()
-    return {f"{quantile:.0%}": value for quantile, value in zip(QUANTILES, found, strict=True)}
+    quantiles = np.quantile(values, QUANTILES, method="nearest").tolist()
+    return {f"{quantile:.0%}": value for quantile, value in zip(QUANTILES, quantiles, strict=True)}

@@ -50,5 +50,5 @@ def _curves(split: Path, table: pa.Table, label: Label) -> list[np.ndarray]:
     if not len(ids):
         return []
     chosen = ids[spread(len(ids), CURVES)]
-    found = require_manifest(split, ["learning_curve"], chosen).table["learning_curve"].to_pylist()
-    return [curve for rates in found if not np.isnan(curve := np.array(rates, np.float64)).all()]
+    curves = require_manifest(split, ["learning_curve"], chosen).table["learning_curve"].to_pylist()
+    return [curve for rates in curves if not np.isnan(curve := np.array(rates, np.float64)).all()]

@@ -131,8 +131,8 @@ is a task of its own.
 
 - **Solved means replayed.** A level is `solved` only if replaying its actions from its initial state, through the \
 engine, reached the goal. `levelproof verify` repeats the replay on your machine.
-- **Nothing tried is left out.** The manifests have a row for each of {tried} levels, solved or not, with what was \
-tried, learning curves and costs; `trivial` and `unsolvable` levels have labels of their own, each with its reason.
+- **No level that was tried is left out.** The manifests have a row for each of {tried} levels, solved or not, with \
+its search, learning curve and costs; `trivial` and `unsolvable` levels have labels of their own, each with its reason.
 - **The whole world at every step**, stored or recomputed by the engine, bit for bit: draw it, observe it in any way, \
 or start an environment from it."""
 
@@ -206,8 +206,8 @@ def _making(splits: Sequence[SplitFacts]) -> str:
     first = splits[0]
     return (
         "## How it was made\n\nAs configured, each level was searched for a way to the goal, and a PPO expert of its "
-        "own trained on it for at most the budget's env steps; `witness` in the manifest says what found the way. "
-        "The manifests contain the whole configuration.\n\n" + "\n".join(rows) + "\n\n"
+        "own trained on it for at most the budget's env steps; the manifest's column `witness` says where each "
+        "solution came from. The manifests contain the whole configuration.\n\n" + "\n".join(rows) + "\n\n"
         "To remake the levels and their experts, or to check every byte and every witness:\n\n"
         f"    levelproof regenerate manifest=data/{first.path} budget={first.budget} out=again\n"
         f"    levelproof verify data/{first.path}"

@@ -186,7 +186,7 @@ class Session:
 
     def _changed(self, level: Level) -> Message:
         self._take(replace(self._file, level=level))
-        self._witness = None  # it was for the level before the edit
+        self._witness = None  # the old one was for the level before the edit
         return self.level({})
 
     def _take(self, file: LevelFile) -> None:

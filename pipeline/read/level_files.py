@@ -70,7 +70,7 @@ def _origin_of(path: Path, job: JobConfig) -> Origin:
     """Return the origin of a file's level. Raise LevelFileError if it has none that the job can use."""
     if not can_be_noted(str(path)):
         raise LevelFileError(
-            f"Cannot use the level file {path}: its name has characters that terminals cannot show: rename it."
+            f"Cannot use the level file {path}: its name has characters that terminals cannot show, so rename it."
         )
     file = _read_level(path)
     size = name_of(file.level.size)

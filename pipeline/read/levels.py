@@ -94,7 +94,10 @@ def check_sampler(manifest: Manifest) -> None:
     made_with = (manifest.config or {}).get("sampler_version")
     if made_with == SAMPLER_VERSION or from_files(manifest.config or {}):
         return
-    what = f"The levels of {manifest.split} were sampled by version {made_with} of the sampler, and here it is version"
+    what = (
+        f"The levels of {manifest.split} were sampled by version {made_with} of the sampler, but this levelproof has "
+        "version"
+    )
     if made_with not in ALIKE_VERSIONS:
         raise Failure(
             f"{what} {SAMPLER_VERSION}, which makes others from their ids: use the levelproof that made them."

@@ -186,8 +186,8 @@ def _has_controls(column: pa.Array) -> bool:
         data = np.frombuffer(texts.buffers()[2] or b" ", np.uint8)
         if data.min(initial=32) >= 32 and data.max(initial=32) < 127:  # the common case, and fast
             return False
-        found = pc.call_function("match_substring_regex", [texts], pc.MatchSubstringOptions(r"\p{Cc}"))
-        return found.true_count > 0
+        matches = pc.call_function("match_substring_regex", [texts], pc.MatchSubstringOptions(r"\p{Cc}"))
+        return matches.true_count > 0
     nested = pa.types.is_list(column.type) or pa.types.is_struct(column.type)
     return nested and any(map(_has_controls, _inside(column)))
 

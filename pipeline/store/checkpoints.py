@@ -141,11 +141,11 @@ def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, KeptExper
         witness, path = rows.get(level_id, ("", None))
         if path and (witness not in BY_EXPERT or job.stop.rule == Rule.BUDGET):
             paths.setdefault(path, set()).add(level_id)
-    found: dict[int, KeptExpert] = {}
+    unsolved: dict[int, KeptExpert] = {}
     for path, ids in paths.items():
         experts = load_experts(data_path(source, path), job)
-        found |= {i: experts[i] for i in ids if not experts[i].begun.training.course.solved}
-    return found
+        unsolved |= {i: experts[i] for i in ids if not experts[i].begun.training.course.solved}
+    return unsolved
 
 
 def _kept_in(source: Path, level_ids: Sequence[int]) -> dict[int, tuple[str | None, str | None]]:

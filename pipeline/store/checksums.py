@@ -62,8 +62,8 @@ def altered(path: Path, digests: Mapping[str, str], name: str) -> list[str]:
         OSError: a file cannot be read.
     """
     files = [file for file in digests if file.rpartition("/")[2] == name and _is_below(file)]
-    found = at_once(path, lambda file: _digest(path / file), files)
-    return [file for file, digest in zip(files, found, strict=True) if digest != digests[file]]
+    actual = at_once(path, lambda file: _digest(path / file), files)
+    return [file for file, digest in zip(files, actual, strict=True) if digest != digests[file]]
 
 
 def _digest(path: Path) -> str:
@@ -91,14 +91,14 @@ def has_own(path: Path) -> bool:
         size = file.seek(0, os.SEEK_END)
         file.seek(max(0, size - TAIL))
         start = max(0, _footer(file.read(), size) - OWN)
-        rest = hashlib.sha256()
+        digest = hashlib.sha256()
         file.seek(0)
         for first in range(0, start, BLOCK):
-            rest.update(file.read(min(BLOCK, start - first)))
+            digest.update(file.read(min(BLOCK, start - first)))
         own = file.read(OWN)
         while block := file.read(BLOCK):
-            rest.update(block)
-    return own == MARK + rest.digest()
+            digest.update(block)
+    return own == MARK + digest.digest()
 
 
 def _footer(end: bytes, size: int) -> int:

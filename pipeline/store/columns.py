@@ -214,9 +214,9 @@ def schema_of(
     return pa.schema(fields)
 
 
-def completed(table: pa.Table, asked: Sequence[str]) -> pa.Table:
+def completed(table: pa.Table, requested: Sequence[str]) -> pa.Table:
     """Append the requested columns that an older version lacks, as nulls."""
     for column in DESCRIBED:
-        if column.name in asked and column.name not in table.column_names:
+        if column.name in requested and column.name not in table.column_names:
             table = table.append_column(COLUMNS.field(column.name), pa.nulls(table.num_rows, column.type))
     return table

@@ -42,18 +42,18 @@ def kept(arrays: Mapping[str, np.ndarray], encoding: Encoding) -> dict[str, np.n
     """Return what a shard stores of all fields (level axis last; time first except in `level/` fields)."""
     if encoding.density == "full":
         return dict(arrays)
-    found = {name: x for name, x in arrays.items() if name.startswith("level/") or name in MOVES}
+    stored = {name: x for name, x in arrays.items() if name.startswith("level/") or name in MOVES}
     states = {name: x for name, x in arrays.items() if name.startswith(STATE)}
     if encoding.density == "resume":
-        return found | states
+        return stored | states
     states[LAST_DISTANCE] = arrays[LAST_DISTANCE]
     at, there = key_rows(arrays["record/done"], encoding.key_every)
     for name, x in states.items():
         frames = np.take_along_axis(x, _along(at, x), 0)
-        found[KEY + name.removeprefix("record/")] = np.where(_along(there, x), frames, np.zeros_like(frames))
+        stored[KEY + name.removeprefix("record/")] = np.where(_along(there, x), frames, np.zeros_like(frames))
     states, rows = task_states(arrays, STATE, arrays[WIDE]), np.arange(RECORD_STEPS)[:, None]
-    found[CHECKSUM] = in_runs(checksum(states, rows), encoding)
-    return found
+    stored[CHECKSUM] = in_runs(checksum(states, rows), encoding)
+    return stored
 
 
 def needed(wanted: Iterable[str], stored: Iterable[str]) -> set[str]:
@@ -76,8 +76,8 @@ def restored(stored: Mapping[str, np.ndarray], wanted: Iterable[FieldSpec], enco
     unlike = np.full(levels, -1)
     if missing and levels:
         paths = frozenset(name.removeprefix("record/") for name in missing)
-        found, unlike = (_from_states if encoding.density == "resume" else _from_actions)(stored, encoding, paths)
-        arrays |= {name: found[name.removeprefix("record/")] for name in missing}
+        recomputed, unlike = (_from_states if encoding.density == "resume" else _from_actions)(stored, encoding, paths)
+        arrays |= {name: recomputed[name.removeprefix("record/")] for name in missing}
     elif missing:
         arrays |= {name: np.empty((specs[name].steps, *specs[name].shape, 0), specs[name].dtype) for name in missing}
     return Restored({name: arrays[name] for name in specs}, unlike)

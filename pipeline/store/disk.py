@@ -20,7 +20,7 @@ REFUSALS = {
     errno.EACCES: "writing is not permitted: check the folder's permissions",
     errno.EPERM: "writing is not permitted: check the folder's permissions",
 }
-FAILS = {errno.EIO: "the disk fails: see `dmesg`"}  # perhaps only once, so the unit is retried
+FAILS = {errno.EIO: "the disk reports an error: see `dmesg`"}  # perhaps only once, so the unit is retried
 
 
 class NotRegular(UserError):

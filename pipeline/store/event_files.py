@@ -1,6 +1,6 @@
 """Events of runs, as JSON lines in one small file per run below the split's `events/`.
 
-They are for people who watch a run: no commit and no reader of a split depends on them, so they may be deleted.
+They are for users who watch a run: no commit and no reader of a split depends on them, so they may be deleted.
 """
 
 import json
@@ -64,10 +64,10 @@ def events_of(path: Path) -> list[dict[str, Any]]:
         data = get(path, MAX_BYTES).data if is_remote(path) else path.read_bytes()
     except OSError:
         return []
-    found = []
+    events = []
     for line in data.decode(errors="replace").splitlines():
         with suppress(ValueError, RecursionError):
             event = json.loads(line)
             if isinstance(event, dict) and isinstance(event.get("time"), float) and isinstance(event.get("event"), str):
-                found.append(event)
-    return found
+                events.append(event)
+    return events

@@ -33,7 +33,7 @@ class Fragment:
     """Metadata of one fragment, without its rows."""
 
     path: Path
-    config_hash: str  # of `config`
+    config_hash: str  # hash of `config`
     config: dict[str, Any]  # the settings that decide results, with current names
     digests: dict[str, dict[str, str]]  # of the files of each shard and checkpoint that its rows name
     rows: int
@@ -68,10 +68,10 @@ def read_fragment(
             digests, densities = _digests_in(metadata), _densities_in(metadata)
             fragment = Fragment(path, config_hash, config, digests, file.rows, SEALED_KEY in metadata, densities)
             wanted = COLUMNS.names if columns is None else columns
-            found = file.read(
+            stored = file.read(
                 [name for name in wanted if name in VERSIONS[version]], VERSIONS[version], level_ids, compact
             )
-            table = _with_hash(completed(found, wanted), written, config_hash)
+            table = _with_hash(completed(stored, wanted), written, config_hash)
             if "level_id" in table.column_names:
                 _require_own_levels(table.column("level_id").to_numpy(), path)
             _require_known(table)
@@ -104,17 +104,17 @@ def _require_known(table: pa.Table) -> None:
 
 
 def _densities_in(metadata: Mapping[bytes, bytes]) -> frozenset[str]:
-    found = frozenset(json.loads(metadata.get(DENSITIES_KEY, json.dumps(FULL))))
-    if not found <= DENSITIES:
+    densities = frozenset(json.loads(metadata.get(DENSITIES_KEY, json.dumps(FULL))))
+    if not densities <= DENSITIES:
         raise ValueError("it names an unknown density")
-    return found
+    return densities
 
 
 def _digests_in(metadata: Mapping[bytes, bytes]) -> dict[str, dict[str, str]]:
-    found = json.loads(metadata.get(DIGESTS_KEY, b"{}"))
-    if not isinstance(found, dict) or not all(isinstance(files, dict) for files in found.values()):
+    digests = json.loads(metadata.get(DIGESTS_KEY, b"{}"))
+    if not isinstance(digests, dict) or not all(isinstance(files, dict) for files in digests.values()):
         raise ValueError("its digests are invalid")
-    return found
+    return digests
 
 
 @lru_cache(maxsize=8)

@@ -33,7 +33,7 @@ def split_url(parts: Sequence[str]) -> tuple[Repository, str]:
     """Split the parts of a URL after `hf://` into a repository and a path in it.
 
     Raises:
-        UserError: the URL is not of a dataset.
+        UserError: the URL does not name a dataset.
     """
     if len(parts) < 3 or parts[0] != "datasets":
         raise UserError(
@@ -66,11 +66,11 @@ def files_below(repository: Repository, folder: str) -> dict[str, tuple[str, int
     """
     revision = quote(repository.revision, safe="")
     url = f"{_endpoint()}/api/datasets/{repository.name}/tree/{revision}/{quote(folder)}?recursive=true"
-    found: dict[str, tuple[str, int]] = {}
+    listed: dict[str, tuple[str, int]] = {}
     while url:
         files, url = _page(url)
-        found |= files
-    return found
+        listed |= files
+    return listed
 
 
 def _page(url: str) -> tuple[dict[str, tuple[str, int]], str]:
@@ -106,12 +106,12 @@ def _files(text: bytes) -> dict[str, tuple[str, int]]:
     entries = json.loads(text)
     try:
         files = [entry for entry in entries if entry["type"] == "file"]
-        found = {entry["path"]: (entry["oid"], entry["size"]) for entry in files}
+        listed = {entry["path"]: (entry["oid"], entry["size"]) for entry in files}
     except (TypeError, KeyError) as error:
         raise ValueError("its list of files is invalid") from error
-    if not all((type(path), type(oid), type(size)) == (str, str, int) for path, (oid, size) in found.items()):
+    if not all((type(path), type(oid), type(size)) == (str, str, int) for path, (oid, size) in listed.items()):
         raise ValueError("its list of files is invalid")
-    return found
+    return listed
 
 
 def _endpoint() -> str:

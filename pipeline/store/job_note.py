@@ -1,4 +1,4 @@
-"""`job.json`: the levels that the last command wanted and those already in the split, so that losses are noticed."""
+"""`job.json`: the levels that the last command requested and those already in the split, so that losses show."""
 
 import hashlib
 import json

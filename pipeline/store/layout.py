@@ -83,9 +83,9 @@ def made_within(data: Iterable[Path], fragment: Path) -> list[Path]:
 
 def attempt_of(path: Path) -> str:
     """Parse the attempt's name from a path that matches `BEGUN` or `DATA`."""
-    found = re.search(ATTEMPT, path.name)
-    assert found, path
-    return found[0]
+    match = re.search(ATTEMPT, path.name)
+    assert match, path
+    return match[0]
 
 
 def data_path(split: Path, name: str) -> Path:
@@ -134,10 +134,10 @@ def entries(split: Path, folder: str, paths: re.Pattern[str], is_kind: Callable[
         return {path: number for path, number in listed.items() if paths.fullmatch(os.path.join(folder, path.name))}
     if not (split / folder).is_dir():
         return {}
-    with os.scandir(split / folder) as found:
+    with os.scandir(split / folder) as listing:
         return {
             split / folder / entry.name: entry.inode()
-            for entry in found
+            for entry in listing
             if paths.fullmatch(os.path.join(folder, entry.name)) and is_kind(entry, follow_symlinks=False)
         }
 

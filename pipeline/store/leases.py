@@ -96,10 +96,10 @@ class Lease:
     def _own(self) -> Version | None:
         """Return the store's version, if this writer put it."""
         try:
-            found = get(self._path)
+            lock = get(self._path)
         except FileNotFoundError:
             return None
-        return found.version if _parsed(found.data).get("writer") == self.token else None
+        return lock.version if _parsed(lock.data).get("writer") == self.token else None
 
     def _text(self) -> bytes:
         return _about(self.token, **{RENEWALS: self._renewals}).encode()
@@ -177,15 +177,15 @@ def is_leased(split: Path, say: Callable[[str], None]) -> bool:
     while True:
         asked = time.monotonic()
         try:
-            found = get(split / WRITER_LOCK, MAX_BYTES).data
+            data = get(split / WRITER_LOCK, MAX_BYTES).data
         except OSError:  # missing, or too large for a lock file
             return False
-        holder = _parsed(found)
+        holder = _parsed(data)
         if RENEWALS not in holder or _died_here(holder):
             return False
         if not first:
-            first, begun = found, time.monotonic()
-        elif found != first:
+            first, begun = data, time.monotonic()
+        elif data != first:
             return True
         elif asked - begun > WATCH:
             return False
@@ -200,8 +200,8 @@ def _taken(path: Path, text: bytes, say: Callable[[str], None]) -> Version:
     before: tuple[str, Version | None] | None = None
     while True:
         try:
-            found = get(path)
-            holder, version = _parsed(found.data), found.version
+            lock = get(path)
+            holder, version = _parsed(lock.data), lock.version
         except FileNotFoundError:
             holder, version = {}, None
         writer, now = str(holder.get("writer", "")), time.monotonic()
@@ -213,8 +213,8 @@ def _taken(path: Path, text: bytes, say: Callable[[str], None]) -> Version:
             since = now
         before = writer, version
         if not writer or now - since > SILENCE or _died_here(holder):
-            if mine := put_if(path, text, version):
-                return mine
+            if lock_version := put_if(path, text, version):
+                return lock_version
         elif now - begun > NOTICE:
             say(
                 f"Waiting to see whether process {holder.get('pid')} on {holder.get('host')} still writes to "
@@ -247,10 +247,10 @@ def _about(token: str, **more: int) -> str:
 def _parsed(data: bytes) -> dict[str, Any]:
     """Parse a lock file; the writer of an invalid one is unknown."""
     try:
-        found = json.loads(data)
+        content = json.loads(data)
     except (ValueError, RecursionError):
-        found = None
-    return found if isinstance(found, dict) else {"writer": "unknown"}
+        content = None
+    return content if isinstance(content, dict) else {"writer": "unknown"}
 
 
 def _here() -> str:

@@ -88,7 +88,7 @@ def write_fragment(
         file.write(with_own(whole.getvalue().to_pybytes()))
     flush_entry(attempt.begun)
     attempt.begun.replace(attempt.fragment)
-    flush_entry(attempt.fragment.parent)  # its new name
+    flush_entry(attempt.fragment.parent)  # makes the fragment's name durable
 
 
 def settings_metadata(config_hash: str, config: Mapping[str, Any]) -> dict[bytes, bytes]:
@@ -147,8 +147,8 @@ class Manifest:
 
     def counts(self, mask: np.ndarray) -> dict[str, int]:
         """Count the labels of the rows in `mask`, the most frequent first."""
-        found = self.table.column("label").filter(mask).value_counts().to_pylist()
-        return {entry["values"]: entry["counts"] for entry in sorted(found, key=lambda entry: -entry["counts"])}
+        counted = self.table.column("label").filter(mask).value_counts().to_pylist()
+        return {entry["values"]: entry["counts"] for entry in sorted(counted, key=lambda entry: -entry["counts"])}
 
     @property
     def shards(self) -> frozenset[str]:
@@ -190,11 +190,11 @@ def read_manifest(
     names = COLUMNS.names if columns is None else list(dict.fromkeys(["level_id", *columns]))
     if unknown := [name for name in names if name not in COLUMNS.names]:
         raise UserError(f"There is no column {unknown[0]!r}: the manifest has {', '.join(COLUMNS.names)}.")
-    asked = None if level_ids is None else ascending(np.asarray(level_ids, np.int64))
+    requested = None if level_ids is None else ascending(np.asarray(level_ids, np.int64))
     if is_seed(split):
-        parts = seed_parts(split, names, asked, compact, each)
+        parts = seed_parts(split, names, requested, compact, each)
     else:
-        parts = _parts(split, asked, partial(_part, names=names, level_ids=asked, compact=compact, each=each))
+        parts = _parts(split, requested, partial(_part, names=names, level_ids=requested, compact=compact, each=each))
     fragments = tuple(fragment for fragment, _ in parts)
     for fragment in fragments[1:]:
         if fragment.config_hash != fragments[0].config_hash:
@@ -224,16 +224,16 @@ def _parts(
     A seal removes fragments once a sealed one has their levels, so a level may move between two fragments unseen. This
     lists the folder again until a listing finds no new sealed fragment, and no listed one that is missing when read.
     """
-    found: dict[tuple[Path, int], tuple[Fragment, pa.Table]] = {}
+    parts_read: dict[tuple[Path, int], tuple[Fragment, pa.Table]] = {}
     with ThreadPoolExecutor(THREADS) as threads:
         for listing in range(MAX_LISTINGS):
             listed = entries(split, MANIFEST, FRAGMENT, DirEntry.is_file).items()
-            new = [entry for entry in listed if entry not in found and _wanted(entry[0], level_ids)]
+            new = [entry for entry in listed if entry not in parts_read and _wanted(entry[0], level_ids)]
             parts = list(with_bar(threads.map(read, (path for path, _ in new)), "fragments", len(new), MANY))
-            found |= {entry: part for entry, part in zip(new, parts, strict=True) if part}
+            parts_read |= {entry: part for entry, part in zip(new, parts, strict=True) if part}
             if listing and all(part and not part[0].sealed for part in parts):
-                latest = {path: part for (path, _), part in found.items()}  # a path's file may have been replaced
-                return [latest[path] for path in sorted(latest) if latest[path][0].rows]  # those without rows: fences
+                latest = {path: part for (path, _), part in parts_read.items()}  # a path's file may have been replaced
+                return [latest[path] for path in sorted(latest) if latest[path][0].rows]  # fences have no rows
     raise Failure(f"The fragments of {split} change faster than they can be read: try again after the writer ends.")
 
 
@@ -331,7 +331,7 @@ def _nothing_at(split: Path) -> str:
     """Say in a sentence why a folder is not a split."""
     require_known(split)
     here = [] if is_remote(split) else [f"{above}{MANIFEST}" for above in ("*/", "*/*/", "*/*/*/")]
-    below = [found.parent for pattern in here for found in split.glob(pattern)]
+    below = [path.parent for pattern in here for path in split.glob(pattern)]
     if below:
         names = ", ".join(map(str, sorted(below)[:MAX_SHOWN]))
         return f"{split} is not a split, but a folder of {len(below)}: name one of them, such as {names}."

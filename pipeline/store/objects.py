@@ -55,10 +55,10 @@ def get(path: Path, most: float = inf) -> StoredFile:
         response = obstore_module().get(store, key)
         return StoredFile(data_of(response, most), Version.of(response.meta))
 
-    found = ask(path, request)
-    if len(found.data) > most:
+    file = ask(path, request)
+    if len(file.data) > most:
         raise OSError(f"{as_typed(path)} is larger than {most} bytes")
-    return found
+    return file
 
 
 def begin_of(path: Path, most: int) -> tuple[bytes, int]:
@@ -133,7 +133,7 @@ def require_conditions(probe: Path) -> None:
     except (NotImplementedError, obstore_module().exceptions.NotSupportedError):
         supported = False
     except StoreFailure as failure:
-        if "(501" not in str(failure):  # with its bracket, because the URL may contain any number
+        if "(501" not in str(failure):  # with the bracket, because the URL may contain any number
             raise
         supported = False
     if not supported:

@@ -37,10 +37,10 @@ class RecordPlace(NamedTuple):
 
 def place_of(file: str) -> RecordPlace | None:
     """Return the record that a row's `file` names; None: it names a level file."""
-    found = RECORD.fullmatch(file)
-    if not found or not os.path.isdir(f"{found[1]}/{found[2]}") or os.path.exists(file):  # `file` may be any string
+    match = RECORD.fullmatch(file)
+    if not match or not os.path.isdir(f"{match[1]}/{match[2]}") or os.path.exists(file):  # `file` may be any string
         return None
-    return RecordPlace(Path(found[1]), found[2], int(found[3]))
+    return RecordPlace(Path(match[1]), match[2], int(match[3]))
 
 
 class Origin(NamedTuple):
@@ -52,15 +52,15 @@ class Origin(NamedTuple):
     split: str = ""  # absolute path of a split with the level
     shard: str = ""  # path below the split; empty: no shard has the level
     row: int = 0
-    level_id: int = 0  # in the shard
+    level_id: int = 0  # id of the level in the shard
 
 
 def origin_of(split: Path, row: Mapping[str, Any]) -> Origin:
     """Return the origin of a manifest row that has the columns ASKED."""
-    found = Origin(row["content_hash"], row["file"] or "", row["size"], as_typed(absolute(split)))
+    origin = Origin(row["content_hash"], row["file"] or "", row["size"], as_typed(absolute(split)))
     if not row["shard"]:
-        return found
-    return found._replace(shard=row["shard"], row=row["row"], level_id=row["level_id"])
+        return origin
+    return origin._replace(shard=row["shard"], row=row["row"], level_id=row["level_id"])
 
 
 def origins_of(split: Path, level_ids: Collection[int]) -> dict[int, Origin]:
@@ -98,5 +98,5 @@ def require_same_levels(split: Path, origins: Mapping[int, Origin], done: Collec
         if row["content_hash"] != here.content_hash:
             raise UserError(
                 f"The levels of {here.file} and {row['file']} happen to have the same id, {row['level_id']}: "
-                "label one of them elsewhere, with out=NAME."
+                "label one of them in another folder, with out=NAME."
             )

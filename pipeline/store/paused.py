@@ -107,15 +107,15 @@ def load_paused(split: Path, level_ids: Collection[int], job: JobConfig) -> dict
         CheckpointUnread: a checkpoint that may hold one of them cannot be read.
         StoreFailure: the store does not answer.
     """
-    wanted, found = set(level_ids), dict[int, Paused]()
+    wanted, experts = set(level_ids), dict[int, Paused]()
     for path in _paths(split, CHECKPOINT):
         first, last = ids_of(path)
         if not any(first <= level_id <= last for level_id in wanted):
             continue
         for level_id, expert in _load(path, wanted, job).items():
-            if level_id not in found or _updates(expert) > _updates(found[level_id]):
-                found[level_id] = expert
-    return found
+            if level_id not in experts or _updates(expert) > _updates(experts[level_id]):
+                experts[level_id] = expert
+    return experts
 
 
 def drop_paused(split: Path, unit: str, level_ids: Collection[int]) -> None:
@@ -176,8 +176,8 @@ def _updates(paused: Paused) -> int:
 
 def _arrays(paused: Paused) -> Any:
     """Return the parts that have the same shape for every expert."""
-    expert, pending, rollouts, _, found = paused
-    return expert.begun, pending, np.int64(rollouts), found._replace(source=())
+    expert, pending, rollouts, _, findings = paused
+    return expert.begun, pending, np.int64(rollouts), findings._replace(source=())
 
 
 def _stamp(job: JobConfig) -> str:
@@ -268,7 +268,7 @@ def _experts(arrays: dict[str, np.ndarray], job: JobConfig) -> Iterator[tuple[in
     rows = unstacked(arrays, "paused/", like, len(level_ids))
     evaluations = unstacked(arrays, "evaluation/", evaluation, len(evaluated)) if len(evaluated) else []
     for i, (level_id, row) in enumerate(zip(level_ids.tolist(), rows, strict=True)):
-        begun, pending, rollouts, found = row
-        mine = [evaluations[j] for j in np.flatnonzero(evaluated == i)]
-        found = found._replace(source=[Source(str(arrays["source"][i]))])
-        yield level_id, Paused(kept(begun, arrays["curve"][i]), pending, int(rollouts), mine, found)
+        begun, pending, rollouts, findings = row
+        successes = [evaluations[j] for j in np.flatnonzero(evaluated == i)]
+        findings = findings._replace(source=[Source(str(arrays["source"][i]))])
+        yield level_id, Paused(kept(begun, arrays["curve"][i]), pending, int(rollouts), successes, findings)

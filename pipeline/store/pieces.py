@@ -13,7 +13,7 @@ from levelproof.pipeline.store.disk import NotRegular, regular, write_new
 
 CHECKSUM = 4  # bytes of a CRC-32C after each piece: a loss of power can leave other bytes
 TOUCH_INTERVAL = 60.0  # s between updates of a piece's time of use
-KEPT_SHARE = 0.9  # of the bound, to which an exceeded cache shrinks
+KEPT_SHARE = 0.9  # share of the bound to which an exceeded cache shrinks
 ABANDONED = 3600.0  # s; an older temporary file is from a killed process
 MAX_PIECE = 2**24  # bytes
 PARTS = 16  # the folder is scanned each time that 1/PARTS of the bound was added
@@ -84,17 +84,17 @@ class PieceCache:
 
     def _make_room(self) -> None:
         """Remove the least recently used pieces, and what killed processes left half-written."""
-        found, now = [], time.time()
+        pieces, now = [], time.time()
         with os.scandir(self.folder) as entries:
             for entry in entries:
                 with suppress(FileNotFoundError):
                     about = entry.stat(follow_symlinks=False)
                     if not entry.name.startswith(".") or now - about.st_mtime > ABANDONED:
-                        found.append((about.st_mtime, about.st_size, entry.path))
-        total = sum(size for _, size, _ in found)
+                        pieces.append((about.st_mtime, about.st_size, entry.path))
+        total = sum(size for _, size, _ in pieces)
         if total <= self.most:
             return
-        for _, size, path in sorted(found):
+        for _, size, path in sorted(pieces):
             if total <= KEPT_SHARE * self.most:
                 break
             with suppress(FileNotFoundError):

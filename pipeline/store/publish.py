@@ -117,7 +117,7 @@ def _barred(fragment: Path) -> bool:
 
 
 class _Committed(NamedTuple):
-    """Content of a fragment's path."""
+    """Level ids and version of the object at a fragment's path."""
 
     ids: frozenset[int]  # empty for a fence or a missing file
     version: Version | None
@@ -125,11 +125,11 @@ class _Committed(NamedTuple):
 
 def _at(fragment: Path) -> _Committed:
     try:
-        found = get(fragment)
+        file = get(fragment)
     except FileNotFoundError:
         return _Committed(frozenset(), None)
     try:
-        return _Committed(_ids(found.data), found.version)
+        return _Committed(_ids(file.data), file.version)
     except DAMAGE:
         raise Failure(f"The fragment {fragment} is damaged: remove it, and run the same command again.") from None
 

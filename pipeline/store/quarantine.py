@@ -69,6 +69,6 @@ def _levels_in(note: Path) -> list[tuple[int, int]]:
                 data = file.readline(MAX_LINE)
     except (OSError, LevelproofError):
         return []
-    found = LEVELS.match(data.decode(errors="replace"))
-    pairs = [run.split("-") for run in found[1].split(", ")] if found else []
+    match = LEVELS.match(data.decode(errors="replace"))
+    pairs = [run.split("-") for run in match[1].split(", ")] if match else []
     return [(int(first), int(last)) for first, last in pairs]

@@ -115,13 +115,13 @@ def stored_in(folder: Path) -> dict[Path, Stored]:
     store, key = place(folder)
     if folder.parts[0] in HUB:
         repository, key = hub.split_url(folder.parts[1:])
-        found = {name: Stored(*about) for name, about in hub.files_below(repository, key).items()}
+        files = {name: Stored(*about) for name, about in hub.files_below(repository, key).items()}
     else:
         listed = ask(folder, lambda: obstore_module().list(store, prefix=key).collect())
-        found = {entry["path"]: Stored(_tag(entry), entry["size"]) for entry in listed}
+        files = {entry["path"]: Stored(_tag(entry), entry["size"]) for entry in listed}
     return {
         folder / name[len(key) + 1 :]: about
-        for name, about in found.items()
+        for name, about in files.items()
         if name.startswith(f"{key}/") and ".." not in name.split("/")
     }
 
@@ -129,10 +129,10 @@ def stored_in(folder: Path) -> dict[Path, Stored]:
 def names_in(folder: Path) -> list[Path]:
     """List the files and folders in a folder, as the store has them now. Raises as `stored_in`."""
     store, key = place(folder)
-    found = ask(folder, lambda: obstore_module().list_with_delimiter(store, prefix=key))
+    listing = ask(folder, lambda: obstore_module().list_with_delimiter(store, prefix=key))
     return [
         folder / name[len(key) + 1 :]
-        for name in [*found["common_prefixes"], *(file["path"] for file in found["objects"])]
+        for name in [*listing["common_prefixes"], *(file["path"] for file in listing["objects"])]
     ]
 
 
@@ -146,8 +146,8 @@ def fragments_in(folder: Path) -> dict[Path, Stored]:
         if folder.parent in known.parents:
             _known.pop(known, None)
     if folder.parts[0] not in WEB:
-        found = _known[folder] = stored_in(folder)
-        return found
+        listing = _known[folder] = stored_in(folder)
+        return listing
     store, key = place(folder / INDEX)
     try:
         text = ask(folder / INDEX, lambda: data_of(obstore_module().get(store, key), MAX_INDEX))
@@ -228,7 +228,7 @@ class RemoteFile:
             return answer.meta, data_of(answer, last - first)
 
         about, data = ask(self.path, request)
-        tag = self._about.tag if self.path.parts[0] in HUB else _tag(about)  # its file servers use other tags
+        tag = self._about.tag if self.path.parts[0] in HUB else _tag(about)  # the hub's file servers use other tags
         if (tag, about["size"], len(data)) != (*self._about, last - first):
             _known.pop(_folder_of(self.path), None)
             raise OSError(f"{as_typed(self.path)} has changed")
@@ -378,8 +378,8 @@ def _explained(path: Path, text: str, what: str) -> LevelproofError:
         return UserError(f"There are no credentials to {what} {url}: {how}.")
     if "Range request not supported" in text:
         return StoreFailure(f"The server of {url} does not support range requests: copy the split to a folder first.")
-    found = STATUS.search(text)
-    reason = found[1].strip() if found else "it does not answer" if SILENT in text else text.splitlines()[0]
+    status = STATUS.search(text)
+    reason = status[1].strip() if status else "it does not answer" if SILENT in text else text.splitlines()[0]
     if reason.startswith(("401", "403")):
         return UserError(f"The store does not let you {what} {url} ({reason}): {how}.")
     then = "run the same command again; what is committed stays" if what == "write" else "try again"

@@ -56,7 +56,7 @@ def _made(parent: Path, prefix: str) -> tuple[Path, int]:
     """Make a folder; return it with the descriptor that holds its lock. Retries if another process sweeps it first."""
     while True:
         folder = Path(mkdtemp(prefix=prefix, dir=parent))
-        with suppress(FileNotFoundError):  # it was swept
+        with suppress(FileNotFoundError):  # another process swept the folder
             lock = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
             try:
                 with suppress(OSError):  # without locks, no process can sweep it either
@@ -74,8 +74,8 @@ def _made(parent: Path, prefix: str) -> tuple[Path, int]:
 
 @cache
 def _sweep_once(parent: Path, prefix: str) -> None:
-    with suppress(OSError), os.scandir(parent) as found:  # a folder that cannot be listed is not swept
-        for entry in found:
+    with suppress(OSError), os.scandir(parent) as entries:  # a folder that cannot be listed is not swept
+        for entry in entries:
             if entry.name.startswith(prefix) and entry.is_dir(follow_symlinks=False):
                 with suppress(OSError):  # other processes sweep, too
                     _sweep(Path(entry.path))
@@ -95,7 +95,7 @@ def _sweep(folder: Path) -> None:
         if not stat.S_ISREG(about.st_mode) or about.st_uid != os.getuid():
             return
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        is_empty = not (folder / FILES).exists()  # its process died before it wrote anything
+        is_empty = not (folder / FILES).exists()  # the process died before it wrote anything
         if _is_at(lock, folder / LOCK) and (is_empty or _is_here(os.read(lock, MAX_ABOUT))):
             _remove(folder)
     finally:

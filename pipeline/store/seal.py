@@ -189,12 +189,12 @@ def _places(table: pa.Table, shards: Mapping[str, Path], moved: Callable[[int], 
     for name, path in shards.items():
         moved(0)
         encodings[name] = Shard(path).encoding
-    found: dict[Encoding, list[Place]] = {}
+    by_encoding: dict[Encoding, list[Place]] = {}
     columns = (table.column(column).to_pylist() for column in ("shard", "row", "level_id"))
     for name, row, level_id in zip(*columns, strict=True):
         if name:
-            found.setdefault(encodings[name], []).append(Place(shards[name], row, level_id))
-    return found
+            by_encoding.setdefault(encodings[name], []).append(Place(shards[name], row, level_id))
+    return by_encoding
 
 
 @contextmanager
@@ -232,16 +232,16 @@ def _converted(
     converted: Callable[[int], None],
 ) -> dict[Encoding, list[Place]]:
     """Convert trajectories of other densities to new shards; return the places of all, ordered by level id."""
-    found, wanted = [], None
+    all_places, wanted = [], None
     for encoding, sources in places.items():
         wanted = replace(encoding, density=density[0], key_every=density[1])
         if encoding.as_json() == wanted.as_json():
-            found += sources
+            all_places += sources
             continue
         for some in convert(sources, *density, another):
-            found += some
+            all_places += some
             converted(len(some))
-    return {wanted: sorted(found, key=lambda place: place.level_id)} if wanted else {}
+    return {wanted: sorted(all_places, key=lambda place: place.level_id)} if wanted else {}
 
 
 def convert(
@@ -287,5 +287,5 @@ def _moved(table: pa.Table, merged: Mapping[Path, Sequence[Place]]) -> pa.Table:
         for shard, places in merged.items()
         for row, place in enumerate(places)
     }
-    found = [now.get(level_id, (None, None)) for level_id in table.column("level_id").to_pylist()]
-    return with_places(table, *zip(*found, strict=True))
+    placed = [now.get(level_id, (None, None)) for level_id in table.column("level_id").to_pylist()]
+    return with_places(table, *zip(*placed, strict=True))

@@ -98,8 +98,8 @@ def _require_restorable(
     """Raise Failure if arrays cannot be recomputed from what is stored of them."""
     if encoding.rules.frame_skip > MAX_FRAME_SKIP:
         raise Failure(f"An env step has {encoding.rules.frame_skip} physics steps: store records with density=full.")
-    found = restored(stored, [field for field in field_table(arrays) if field.name not in stored], encoding)
-    for name, values in found.arrays.items():
+    recomputed = restored(stored, [field for field in field_table(arrays) if field.name not in stored], encoding)
+    for name, values in recomputed.arrays.items():
         if len(wrong := np.flatnonzero(~same_bits(values, arrays[name]))):
             raise Failure(
                 f"The engine on this machine cannot recompute {name} of level {level_ids[wrong[0]]}, which "
@@ -217,16 +217,16 @@ def read_together(
         by_encoding.setdefault(shard.encoding, []).append(i)
     places = _one_after_another(parts) if places is None else places
     if len(by_encoding) == 1:
-        found = parts[0][0].restore(parts, table, places)
-        _report(parts, places, found.unlike, exactly)
-        return found.arrays
-    alone = []
+        group = parts[0][0].restore(parts, table, places)
+        _report(parts, places, group.unlike, exactly)
+        return group.arrays
+    groups = []
     for alike in by_encoding.values():
-        mine = [parts[i] for i in alike]
-        alone.append(mine[0][0].restore(mine, table, _one_after_another(mine)))
-        _report(mine, _one_after_another(mine), alone[-1].unlike, exactly)
+        members = [parts[i] for i in alike]
+        groups.append(members[0][0].restore(members, table, _one_after_another(members)))
+        _report(members, _one_after_another(members), groups[-1].unlike, exactly)
     back = np.argsort(np.concatenate([places[i] for alike in by_encoding.values() for i in alike]))
-    return {name: np.concatenate([found.arrays[name] for found in alone])[back] for name in alone[0].arrays}
+    return {name: np.concatenate([group.arrays[name] for group in groups])[back] for name in groups[0].arrays}
 
 
 def _read_alike(parts: Sequence[Part], table: Sequence[FieldSpec], places: Sequence[Sequence[int]]) -> Restored:
@@ -253,8 +253,8 @@ def _read_alike(parts: Sequence[Part], table: Sequence[FieldSpec], places: Seque
         raise
     if names == {field.name for field in table}:  # nothing is left to compute
         return Restored({field.name: stored[field.name] for field in table}, np.full(sum(map(len, places)), -1))
-    found = restored({name: np.moveaxis(x, 0, -1) for name, x in stored.items()}, table, encoding)
-    return Restored({name: np.moveaxis(x, -1, 0) for name, x in found.arrays.items()}, found.unlike)
+    completed = restored({name: np.moveaxis(x, 0, -1) for name, x in stored.items()}, table, encoding)
+    return Restored({name: np.moveaxis(x, -1, 0) for name, x in completed.arrays.items()}, completed.unlike)
 
 
 def _one_after_another(parts: Sequence[Part]) -> list[range]:

@@ -46,7 +46,7 @@ def writing(job: JobConfig, say: Callable[[str], None], split: Path | None = Non
         stored = {density for fragment in manifest.fragments for density in fragment.densities}
         if stored and job.stored not in stored:
             raise UserError(
-                f"The split {split} has {', '.join(sorted(stored))}, but this command asks for {job.stored}: "
+                f"The split {split} has {', '.join(sorted(stored))}, but this command sets {job.stored}: "
                 "use the same, or another folder with out=NAME."
             )
         yield split, manifest
@@ -74,7 +74,9 @@ def locked(split: Path, say: Callable[[str], None]) -> Iterator[None]:
         StoreFailure, LeaseLost: its store does not answer, or another writer has taken over.
     """
     if is_seed(split):
-        raise UserError(f"{split} has seed files, which no command changes: make a split of them, `levelproof grow`.")
+        raise UserError(
+            f"{split} has seed files, which no command changes: make a split from them with `levelproof grow`."
+        )
     if is_remote(split):
         require_conditions(split / f".{JOB}.{secrets.randbits(60)}")
         with explaining_writes(written_disk(split)), only_writer(split, say):

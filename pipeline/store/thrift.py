@@ -128,12 +128,12 @@ def _value(data: bytes, at: int, kind: int, wanted: Fields) -> tuple[Any, int]:
             length, at = _varint(data, at)
         if length > len(data) - at or (wanted and inner != STRUCT):
             raise ValueError("one of its lists is longer than the remaining bytes, or has the wrong type")
-        found = []
+        values = []
         for _ in range(length):
             value, at = (None, at + 1) if inner in (TRUE, FALSE) else _value(data, at, inner, wanted)
             if wanted:
-                found.append(value)
-        return found, at
+                values.append(value)
+        return values, at
     if kind in (I8, DOUBLE):
         return None, at + (1 if kind == I8 else 8)
     raise ValueError("one of its fields has a type that Arrow does not write")

@@ -149,7 +149,7 @@ class Evidence:
                 put(lane, arrays_of(level_at(origin_of(self.recipe.split, row)), "level/"))
             except Failure as failure:
                 reason = str(failure)[:-1]
-                self._report([True], lambda _, reason=reason: f"cannot be made again: {reason}", lane)
+                self._report([True], lambda _, reason=reason: f"cannot be rebuilt: {reason}", lane)
         return levels
 
     def _check_identities(self, levels: Level) -> Mask:
@@ -214,8 +214,8 @@ class Evidence:
             try:
                 return lanes, self._read_stored(lanes, fields)
             except Failure:
-                found = {i: arrays for i in lanes.tolist() if (arrays := self._read_one(i, fields))}
-        return np.array([*found], int), jax.tree.map(lambda *xs: np.concatenate(xs, -1), *found.values() or ({},))
+                readable = {i: arrays for i in lanes.tolist() if (arrays := self._read_one(i, fields))}
+        return np.array([*readable], int), jax.tree.map(lambda *xs: np.concatenate(xs, -1), *readable.values() or ({},))
 
     def _read_stored(self, lanes: Lanes, fields: Iterable[str] | None) -> dict[str, np.ndarray]:
         """Read arrays of levels, level axis last. Raise Failure if a shard is damaged."""

@@ -51,4 +51,4 @@ def _examine_file(path: Path, findings: Findings, progress: ProgressBar) -> None
             progress.advance(rows.num_rows)
         if content_digest(hashes) != digest:
             last = int(some[-1])
-            findings.add(f"The levels {some[0]} to {last} of {path} are not those that it was written from.", [])
+            findings.add(f"Levels {some[0]} to {last} of {path} differ from those that it was written from.", [])

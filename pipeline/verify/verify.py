@@ -191,8 +191,8 @@ def _recipe(split: Path, fragment: Fragment, findings: Findings) -> Recipe:
     """Return how to make and play the levels. Raise Failure if this version cannot."""
     findings.config = config = fragment.config
     with recorded_settings(split):
-        if config["sampler_version"] not in ALIKE_VERSIONS:  # others are compared by signature
-            raise ConfigError(f"sampler version {config['sampler_version']}, here it is {SAMPLER_VERSION}")
+        if config["sampler_version"] not in ALIKE_VERSIONS:  # levels of alike versions are compared by signature
+            raise ConfigError(f"sampler version {config['sampler_version']}, but this levelproof has {SAMPLER_VERSION}")
         size_of(config["size"])
         rules = typed(TaskParams, config["task"], "task")
         distribution = None if from_files(config) else typed(Distribution, config["distribution"], "distribution")
@@ -256,10 +256,10 @@ def _opened(name: str, recipe: Recipe, level_ids: set[int], findings: Findings) 
 def _changed_files(split: Path, name: str, digests: Mapping[str, str]) -> list[str]:
     """List the files of a shard or of experts that are changed, missing or new."""
     try:
-        found = digests_of(data_path(split, name), digests)
+        current = digests_of(data_path(split, name), digests)
     except (Failure, OSError):
-        found = {}
-    return sorted(file for file in {**found, **digests} if found.get(file) != digests.get(file))
+        current = {}
+    return sorted(file for file in {**current, **digests} if current.get(file) != digests.get(file))
 
 
 def _note_losses(rows: pa.Table, recipe: Recipe, findings: Findings) -> None:
@@ -268,7 +268,7 @@ def _note_losses(rows: pa.Table, recipe: Recipe, findings: Findings) -> None:
     for row, same in zip(rows.to_pylist(), same_stack(rows), strict=True):
         level_id = row["level_id"]
         if not same:
-            findings.unrepairable[level_id] = f"it was made on another stack, of {row['device']}"
+            findings.unrepairable[level_id] = f"it was made with other versions or on another device ({row['device']})"
         if recipe.distribution is None:
             findings.origins[level_id] = origin_of(recipe.split, row | {"shard": None})
             try:

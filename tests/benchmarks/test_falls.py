@@ -81,7 +81,7 @@ def held(level: Level) -> None:
 
 
 def aside(level: Level) -> None:
-    """Make a thruster turn the ball, so that both may lift it."""
+    """Move a thruster off the ball's centre, so that it turns the ball and both thrusters may lift it."""
     level.model.inverse_inertia[BALL] = 100.0
     level.model.thruster_position[:, 1] = 0.2
     level.model.thruster_power[:] *= 1.9

@@ -178,7 +178,7 @@ class TestInput:
     ids=["physics", "experts"],
 )
 def test_tiny_race_runs_for_real(reference, level_file, arguments) -> None:
-    """Run as a user would, pinned to one core if possible, so that the reference has one way to run."""
+    """Run as a user would, pinned to one core if possible, so that the reference's only variant is one process."""
     pin = f"hasattr(os, 'sched_setaffinity') and os.sched_setaffinity(0, {{{own_cores()[0]}}})"
     code = f"import os, sys; {pin}; from benchmarks.__main__ import main; sys.exit(main())"
     command = [sys.executable, "-c", code, *arguments, "--repeats", "2", "--level-file", str(level_file), "--json"]

@@ -67,7 +67,7 @@ def test_slots_that_no_level_has_entered_are_zero() -> None:
 
 
 def test_withdraw_removes_waiting_levels_of_one_submission() -> None:
-    """Even levels that have begun together with earlier ones."""
+    """Waiting levels are removed even if `begin` has already run for them, together with earlier levels."""
     slots = Batcher(WIDTH, 16)
     first, second = submitted(slots, range(5)), submitted(slots, range(5, 10))
     slots.fill(begin)

@@ -142,7 +142,7 @@ def pick(lanes, new, old):
 
 
 def relative_rotation(state):
-    """Of each joint's body b to its body a, rad, (lane, joint)."""
+    """Rotation of each joint's body b relative to its body a, rad, (lane, joint)."""
     rotation = np.concatenate([state.polygon.rotation, state.circle.rotation], 1)
     of_a, of_b = (np.take_along_axis(rotation, index, 1) for index in (state.joint.a_index, state.joint.b_index))
     return of_b - of_a

@@ -1,6 +1,6 @@
 """Make witnesses.npz: the actions that solve the levels of a split, and hashes of the records of replaying them.
 
-Run from the root of the repository after the reference manifest has been made again (see manifests/README.md):
+Run from the root of the repository after the reference manifest has been regenerated (see manifests/README.md):
 
     python -m tests.golden.make_witnesses data/128k/s
 """

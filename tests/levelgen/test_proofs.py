@@ -258,7 +258,7 @@ def test_huge_values_prove_nothing() -> None:
 
 
 def test_body_at_a_nan_position_touches_nothing() -> None:
-    """So breaking the world cannot reach a goal that stands."""
+    """A body of a broken world, whose position is NaN, cannot reach a goal that its old position would."""
     level = world(other=(1.3, 0.6))
     done, goal, _ = play(take(level, np.zeros(LANES, int)), jax.random.key(0), stickiness(), steps=1)
     assert np.asarray(goal).all()

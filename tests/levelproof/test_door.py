@@ -1,4 +1,4 @@
-"""The one package that users import: its names exist, are what they say, and cost nothing until used."""
+"""The one package that users import: its names exist, refer to the right objects, and import nothing until used."""
 
 import ast
 import importlib

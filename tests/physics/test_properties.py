@@ -56,7 +56,7 @@ class TestMomentum:
     @few
     @given(motions, st.booleans(), numbers(-1, 1))
     def test_centre_of_mass_falls_freely(self, motions, fixed, drive) -> None:
-        """With a joint, a motor and collisions among the bodies."""
+        """A joint, a motor and collisions among the bodies do not disturb the fall of their centre of mass."""
         model, state = thrown_together(motions, gravity=-9.81)
         model = changed(model, joint_active={0: True}, joint_fixed={0: fixed}, joint_anchor_a={0: (0.3, 0.0)})
         model = changed(model, collides={(BOX, BALL): False, (BALL, BOX): False})

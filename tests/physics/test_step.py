@@ -133,7 +133,7 @@ class TestRest:
 
     @pytest.mark.parametrize(("wall", "height", "side"), [(0, FLOOR_TOP + HALF - 0.005, -1), (3, 4.805, 1)])
     def test_contacts_of_a_flat_box_begin_at_the_start_of_the_face(self, wall, height, side) -> None:
-        """As in the reference. Faces run clockwise: the floor's to the right, the ceiling's to the left."""
+        """The reference begins there, too. Faces run clockwise: the floor's to the right, the ceiling's to the left."""
         model, state = room()
         state = changed(state, position={BOX: (1.5, height)})
         _, manifold = play(model, state, *idle())
@@ -159,7 +159,7 @@ class TestInactive:
     @few
     @given(st.sampled_from([BOX, BALL, OTHER]), speeds, turns)
     def test_inactive_body_moves_nothing(self, ghost, speed, turn) -> None:
-        """Even inside another body or thrown at it: the others move as if it were far away."""
+        """Inside another body or thrown at it, an inactive body has no effect: others move as if it were far away."""
         victim = BALL if ghost != BALL else OTHER
         model, state = room()
         model = changed(model, active={ghost: False})

@@ -40,7 +40,7 @@ def test_step_returns_the_annotated_shapes() -> None:
 
 
 def test_buffers_of_follows_the_annotations_of_scratch() -> None:
-    """With and without lanes, for all dtypes, with named and numeric axes."""
+    """Cover arrays with and without lanes, all dtypes, and named and numeric axes."""
     scratch = buffers_of(Scratch, FEW)
     contacts = 2 * (6 * 5 // 2 - 4 * 3 // 2) + 3 * 6 + 3
     assert scratch.bodies.motion == Buffer((9, 5))

@@ -76,9 +76,9 @@ def until(condition: Callable[[], T], process: subprocess.Popen[str]) -> T:
     """Wait until the condition holds, and return its value; if it never does, fail with the process's output."""
 
     def value() -> T:
-        found = condition()
-        assert found or process.poll() is None, f"the command ended early: {process.communicate()}"
-        return found
+        result = condition()
+        assert result or process.poll() is None, f"the command ended early: {process.communicate()}"
+        return result
 
     try:
         return wait_until(value, COMMAND_SECONDS, process.args)
@@ -103,11 +103,11 @@ def descendants(process: int) -> set[int]:
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit() and (state := status(int(entry.name))):
             parents[int(entry.name)] = int(state[1])
-    found, below = set(), {process}
+    processes, below = set(), {process}
     while below:
         below = {pid for pid, parent in parents.items() if parent in below}
-        found |= below
-    return found
+        processes |= below
+    return processes
 
 
 def status(pid: int) -> list[str] | None:

@@ -79,12 +79,12 @@ def made_fields(size: str = "s", count: int = 3, seed: int = 0) -> dict[str, np.
     return arrays_of(made_level(size, count, seed), "level/") | arrays_of(made_record(size, count, seed), "record/")
 
 
-def assert_same(found: Mapping[str, np.ndarray], expected: Mapping[str, np.ndarray]) -> None:
+def assert_same(actual: Mapping[str, np.ndarray], expected: Mapping[str, np.ndarray]) -> None:
     """Check that two sets of fields have the same names, types and bits."""
-    assert found.keys() == expected.keys()
+    assert actual.keys() == expected.keys()
     for name, values in expected.items():
-        assert found[name].dtype == values.dtype
-        assert same_bits(found[name], values).all(), name
+        assert actual[name].dtype == values.dtype
+        assert same_bits(actual[name], values).all(), name
 
 
 def _possible(tree: T, size: str, path: str) -> T:

@@ -19,7 +19,7 @@ MINE = b"export PATH"  # content of the user's own file, outside of that folder
 
 @contextmanager
 def no_hang() -> Iterator[None]:
-    """Fail in the `with` block instead of waiting for a pipe."""
+    """Raise TimeoutError in the `with` block if it hangs, as when it waits for a pipe."""
 
     def expire(*_: Any) -> None:
         raise TimeoutError("it hangs")

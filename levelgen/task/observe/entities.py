@@ -73,7 +73,7 @@ class EntityObservation:
     thruster_mask: Bool[Array, "thruster lane"]
     attention_mask: Bool[Array, "4 body body lane"]
     joint_indexes: Int[Array, "joint_end 2 lane"]  # attending body, attended body; 0 for inactive joints
-    thruster_indexes: Int[Array, "thruster lane"]  # its body
+    thruster_indexes: Int[Array, "thruster lane"]  # the body that each thruster is on
 
 
 def entities(level: Level, state: State) -> EntityObservation:
@@ -118,7 +118,7 @@ def _touching(level: Level) -> Bool[Array, "body body lane"]:
     pairs, active = pairs_of(level.size), level.state.contact_active
     n, kinds = len(pairs.polygon), (pairs.polygon, pairs.circle_polygon, pairs.circle)
     first, second = sum((kind.a for kind in kinds), ()), sum((kind.b for kind in kinds), ())
-    row = np.full((level.size.bodies, level.size.bodies), len(first))  # the last row stands for no pair
+    row = np.full((level.size.bodies, level.size.bodies), len(first))  # the last row means "no pair"
     row[first, second] = np.arange(len(first))
     none = jnp.zeros((1, active.shape[-1]), bool)
     return jnp.concatenate([active[:n] | active[n : 2 * n], active[2 * n :], none])[row]

@@ -82,7 +82,7 @@ def _shapes(level: Level, state: State) -> list[Coverage]:
     model, size = level.model, level.size
     centre = state.position * PIXELS_PER_METRE
     colours = _role_colour(level.role, model.inverse_mass == 0)
-    floor = centre[0] + model.vertices[0] * PIXELS_PER_METRE  # its rotation is not drawn
+    floor = centre[0] + model.vertices[0] * PIXELS_PER_METRE  # the floor's rotation is not drawn
     floor_colour = _role_colour(level.role[0], jnp.array(True))
     shapes = [Coverage(*_polygon(floor), floor_colour)]
     for body in range(FIXED_POLYGONS, size.polygons):

@@ -89,8 +89,8 @@ def _chosen(split: Path, where: str | None, most: int) -> tuple[Manifest, int]:
     """Read the rows to show; also return the number that match."""
     if most < 1:
         raise UserError(f"--levels is {most}: a gallery needs at least 1.")
-    everything = require_manifest(split, columns_in(where), compact=True)
-    ids = select(everything.table, where).column("level_id").to_numpy()
+    manifest = require_manifest(split, columns_in(where), compact=True)
+    ids = select(manifest.table, where).column("level_id").to_numpy()
     if not len(ids):
         raise UserError(f"No level of {split} matches {where}: choose others with --where.")
     return require_manifest(split, level_ids=ids[spread(len(ids), most)]), len(ids)

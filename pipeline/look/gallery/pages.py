@@ -14,7 +14,7 @@ from levelproof.pipeline.look.reasons import kind_of_reason
 from levelproof.pipeline.store.columns import COLUMNS
 
 PAGE = 8192  # rows per page
-NOTHING = 2**16 - 1  # index that stands for a missing word
+NOTHING = 2**16 - 1  # index of a missing word
 WORDS = ("label", "label_reason", "witness")
 NOT_SHOWN = ("row",)  # numbers that only locate data
 FLAGS = [field.name for field in COLUMNS if pa.types.is_boolean(field.type)]

@@ -74,7 +74,7 @@ def fields_of(level: Level, record: Record) -> Fields:
         moving[f"{WORLD}{kind}/global_position"] = np.where(unused, np.where(start, at_start, later), points)
     still = level_to_kinetix(level) | fillers(level)
     still |= {
-        "polygon_highlighted": np.zeros((count, size.polygons), bool),  # by the reference's editor
+        "polygon_highlighted": np.zeros((count, size.polygons), bool),  # set by the reference's editor only
         "circle_highlighted": np.zeros((count, size.circles), bool),
     }
     mask = np.asarray(action_mask(jax.tree.map(jnp.asarray, level))).T

@@ -116,10 +116,10 @@ def arrays_in(folder: Path) -> list[StoredArray]:
     if _metadata(folder / GROUP).get("zarr_format") != 2:
         raise FormatError(f"its {GROUP} is not of zarr format 2")
     paths = sorted(path.parent for path in folder.glob(f"*/{ARRAY}"))
-    found = [array for array in map(_array, paths) if array.rows]
-    if not found:
+    arrays = [array for array in map(_array, paths) if array.rows]
+    if not arrays:
         raise FormatError("it has no trajectories")
-    return found
+    return arrays
 
 
 def _array(path: Path) -> StoredArray:

@@ -45,12 +45,12 @@ class SeedFile:
 
 
 def is_seed(path: Path) -> bool:
-    """Whether a path names a seed file or a folder of some, and not a split with shards."""
+    """Whether a path names a seed file or a folder of them, not a split with shards."""
     return bool(seed_files(path))
 
 
 def seed_files(path: Path) -> list[Path]:
-    """List the seed files at a path, by name; none if it is something else."""
+    """List the seed files at a path, by name; none if it is neither a seed file nor a folder of them."""
     if is_remote(path) or not path.is_dir():
         return [path] if path.suffix == SUFFIX and (is_remote(path) or path.is_file()) else []
     if (path / MANIFEST).exists():
@@ -77,8 +77,8 @@ def read_seed(
             version = metadata.get(SEED_KEY, b"?").decode()
             if version != SEED_VERSION:
                 raise Failure(
-                    f"The file {path} is no seed file that this program reads (its version is {version[:9]!r}, not "
-                    f"{SEED_VERSION}): `levelproof export SPLIT --format seed` writes some."
+                    f"The file {path} is not a seed file that this program reads (its version is {version[:9]!r}, not "
+                    f"{SEED_VERSION}): `levelproof export SPLIT --format seed` writes one."
                 )
             config, config_hash = settings_in(metadata[CONFIG_KEY], metadata[HASH_KEY].decode())
             budget, content = metadata[BUDGET_KEY].decode(), json.loads(metadata[CONTENT_KEY])
@@ -107,8 +107,10 @@ def damaged_seed(path: Path, error: Exception) -> Failure:
     return Failure(f"The seed file {path} is damaged ({reason}): " + mended(path, "copy it again from its source."))
 
 
-def _are_digests(found: Any) -> bool:
-    return isinstance(found, list) and all(isinstance(one, str) and re.fullmatch("[0-9a-f]{64}", one) for one in found)
+def _are_digests(digests: Any) -> bool:
+    return isinstance(digests, list) and all(
+        isinstance(one, str) and re.fullmatch("[0-9a-f]{64}", one) for one in digests
+    )
 
 
 def _check(table: pa.Table) -> None:
@@ -137,4 +139,4 @@ def _check_lengths(column: pa.ChunkedArray, most: int) -> None:
     for chunk in column.chunks:
         offsets = np.frombuffer(chunk.buffers()[1], np.int32)[chunk.offset : chunk.offset + len(chunk) + 1]
         if (np.diff(offsets) > most).any():
-            raise ValueError("it has a witness longer than any")
+            raise ValueError(f"it has a witness larger than {most} bytes")

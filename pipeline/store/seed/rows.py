@@ -24,7 +24,7 @@ from levelproof.pipeline.store.seed.columns import KEPT
 from levelproof.pipeline.store.seed.file import SeedFile, damaged_seed, read_seed, seed_files
 from levelproof.pipeline.store.seed.source import LevelSource
 
-# Columns of the manifest, and those of the file that they are made from; `level_id` is always read
+# Manifest column -> columns of the seed file that it is derived from, besides `level_id`, which is always read
 IDENTITIES = ("content_hash", "signature")
 MADE_FROM: dict[str, tuple[str, ...]] = {
     **{name: (name,) for name in KEPT},
@@ -66,8 +66,8 @@ def _positions(path: Path, rows: pa.Table, about: SeedFile) -> np.ndarray:
     """Return the positions of rows in their file, of which some row groups may not have been read."""
     if rows.num_rows == about.fragment.rows:
         return np.arange(rows.num_rows)
-    everything = read_seed(path, [])[1].column("level_id").to_numpy()
-    return np.searchsorted(everything, rows.column("level_id").to_numpy())
+    all_ids = read_seed(path, [])[1].column("level_id").to_numpy()
+    return np.searchsorted(all_ids, rows.column("level_id").to_numpy())
 
 
 def manifest_rows(about: SeedFile, rows: pa.Table, names: Sequence[str], compact: bool) -> pa.Table:
@@ -109,7 +109,7 @@ def _as(column: Any, wanted: pa.DataType) -> Any:
 
 
 def reason_of(label: str, source: str | None, steps: int | None) -> str | None:
-    """Return the reason for a label that follows from the other columns; None: it does not."""
+    """Derive the reason for a label from the other columns; None: it does not follow from them."""
     if label == Label.TRIVIAL and steps:
         return trivial_reason(steps)
     if label == Label.SOLVED and steps and source not in (None, Source.IMPORT):
@@ -122,16 +122,18 @@ def _reasons(rows: pa.Table) -> pa.Array:
     steps = rows.column("steps_to_goal").fill_null(0).to_numpy()
     kept = _codes(rows.column("label_reason"))
     keys = np.stack([label[0], source[0], np.where(kept[0] >= 0, 0, steps), kept[0]], 1)
-    found, index = np.unique(keys, axis=0, return_inverse=True)
+    distinct, index = np.unique(keys, axis=0, return_inverse=True)
     text = [
-        kept[1][k] if k >= 0 else reason_of(label[1][a], source[1][b] if b >= 0 else None, n) or "its file does not say"
-        for a, b, n, k in found.tolist()
+        kept[1][k]
+        if k >= 0
+        else reason_of(label[1][a], source[1][b] if b >= 0 else None, n) or "the seed file has no reason"
+        for a, b, n, k in distinct.tolist()
     ]
     return pa.DictionaryArray.from_arrays(pa.array(index.reshape(-1), pa.int32()), pa.array(text, pa.string()))
 
 
 def _codes(column: pa.ChunkedArray) -> tuple[np.ndarray, list[str]]:
-    """Return the codes of a string column, -1 for null, and what they stand for."""
+    """Return the codes of a string column, -1 for null, and the string of each code."""
     array = column.unify_dictionaries().combine_chunks()
     return array.indices.fill_null(-1).to_numpy(zero_copy_only=False), array.dictionary.to_pylist()
 
@@ -155,9 +157,9 @@ def _made_with(rows: pa.Table, name: str) -> pa.Array:
 
 @cache
 def _parsed(text: str) -> Mapping[str, Any]:
-    found = json.loads(text)
-    pa.array([found["versions"]], COLUMNS.field("versions").type)
-    return found
+    content = json.loads(text)
+    pa.array([content["versions"]], COLUMNS.field("versions").type)
+    return content
 
 
 def _commands(about: SeedFile, rows: pa.Table) -> pa.Array:
@@ -178,10 +180,10 @@ def _commands(about: SeedFile, rows: pa.Table) -> pa.Array:
 def _identities(about: SeedFile, rows: pa.Table) -> dict[str, pa.Array]:
     """Hash the levels of rows, which takes about a tenth of a millisecond for each."""
     source = LevelSource.of(about.fragment.config, about.fragment.path)
-    found: dict[str, list[Any]] = {name: [] for name in IDENTITIES}
+    identities: dict[str, list[Any]] = {name: [] for name in IDENTITIES}
     for first in range(0, rows.num_rows, CHUNK):
         some = rows.slice(first, CHUNK)
         levels = source.levels(some.column("level_id").to_numpy(), some.column("content").to_pylist())
-        found["content_hash"] += content_hashes(levels)
-        found["signature"] += signatures(levels)
-    return {name: pa.array(values, COLUMNS.field(name).type) for name, values in found.items()}
+        identities["content_hash"] += content_hashes(levels)
+        identities["signature"] += signatures(levels)
+    return {name: pa.array(values, COLUMNS.field(name).type) for name, values in identities.items()}

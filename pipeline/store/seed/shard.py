@@ -46,7 +46,7 @@ class SeedShard(Shard):
         self._source = LevelSource.of(config, path)
         self.size = self._source.size
         if size not in (None, name_of(self.size)):
-            raise Failure(f"The levels of {path} have size {name_of(self.size)}, and {size} was expected.")
+            raise Failure(f"The levels of {path} have size {name_of(self.size)}, but {size} was expected.")
         engine = config.get("engine_version", FIRST_VERSION)
         self.encoding = Encoding("witness", rules=self._source.rules, engine_version=engine)
         self.level_ids: Any = rows.column("level_id").to_numpy()
@@ -83,11 +83,13 @@ class SeedShard(Shard):
         """Simulate rows of seed files. Raises as `Shard.restore`."""
         seeds: Any = parts
         try:
-            found = simulate(seeds, table)
+            simulated = simulate(seeds, table)
         except ValueError as error:
             raise damaged_seed(self.path, error) from error
         back = np.argsort(np.concatenate([np.asarray(mine, int) for mine in places]))
-        return Restored({name: np.moveaxis(x, -1, 0)[back] for name, x in found.arrays.items()}, found.unlike[back])
+        return Restored(
+            {name: np.moveaxis(x, -1, 0)[back] for name, x in simulated.arrays.items()}, simulated.unlike[back]
+        )
 
 
 def stored_levels(source: Path, level_ids: np.ndarray) -> Level:
@@ -96,14 +98,14 @@ def stored_levels(source: Path, level_ids: np.ndarray) -> Level:
     Raises:
         Failure: a file is damaged or missing.
     """
-    found: dict[int, bytes | None] = {}
+    contents: dict[int, bytes | None] = {}
     config, path = None, source
     for path in seed_files(source):
         about, rows = read_seed(path, ["content"], np.sort(level_ids))
         config = about.fragment.config
-        found |= dict(zip(rows.column("level_id").to_pylist(), rows.column("content").to_pylist(), strict=True))
+        contents |= dict(zip(rows.column("level_id").to_pylist(), rows.column("content").to_pylist(), strict=True))
     try:
-        return LevelSource.of(config or {}, path).levels(level_ids, [found.get(i) for i in level_ids.tolist()])
+        return LevelSource.of(config or {}, path).levels(level_ids, [contents.get(i) for i in level_ids.tolist()])
     except ValueError as error:
         raise damaged_seed(path, error) from error
 

@@ -47,7 +47,7 @@ class LevelSource:
             if rules.frame_skip > MAX_FRAME_SKIP:
                 raise ConfigError(f"task.frame_skip is {rules.frame_skip}")
             if not isinstance(config.get("engine_version", FIRST_VERSION), int):
-                raise ConfigError("engine_version is no number")
+                raise ConfigError("engine_version is not a number")
         except (ValueError, KeyError, TypeError) as error:
             raise Failure(
                 f"The seed file {path} has settings that this levelproof does not accept ({error})."
@@ -72,7 +72,7 @@ class LevelSource:
         """
         if self.distribution is None:
             if any(one is None for one in content):
-                raise ValueError("it lacks the content of a level that no id makes")
+                raise ValueError("it lacks the content of a level that is not sampled from its id")
             return unpack_worlds([one for one in content if one is not None], self.size)
         ids = np.asarray(level_ids, np.int32)
         lanes = block_size(len(ids), CHUNK)

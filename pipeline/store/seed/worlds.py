@@ -28,7 +28,7 @@ def unpack_worlds(packed: Sequence[bytes], size: Size) -> Level:
     """
     blank = _blank(size)
     if any(len(one) != len(blank) for one in packed):
-        raise ValueError(f"its content is not that of levels of size {name_of(size)}")
+        raise ValueError(f"it does not contain levels of size {name_of(size)}")
     rows = np.frombuffer(b"".join(packed), np.uint8).reshape(len(packed), len(blank)) ^ blank
     arrays = unpack({FLAT: rows}, _table(size))
     check_numbers(arrays, size)

@@ -78,7 +78,7 @@ def test_attention_plays_any_size_and_idle_entries_are_zero(size: str) -> None:
 
 
 def test_transformer_has_the_shape_of_the_reference() -> None:
-    """As counted from its published 786,000 parameters, less the value head: five layers and one number."""
+    """The count is the reference's published 786,000 parameters less its value head, of five layers and an output."""
     network = NetworkConfig(PolicyKind.TRANSFORMER, width=128, depth=2, heads=8)
     shapes = jax.eval_shape(lambda: initial_policy(jax.random.key(0), network, SIZES["m"]))
     value_head = 5 * (128 * 128 + 128) + 129

@@ -183,7 +183,7 @@ def test_further_training_is_independent_of_neighbours_and_pauses(levels: Level)
     paused: dict[int, Paused] = {}
     while not stopped.step():
         for _, i, now in stopped.paused():
-            if now.evaluations and i not in paused:  # it has been solved once
+            if now.evaluations and i not in paused:  # the level has been solved once
                 paused[i] = now
     same(submission.trained(CONFIG), alone)
     assert paused

@@ -82,7 +82,7 @@ def test_search_finds_what_random_play_does_not() -> None:
 
 
 def test_search_topples_a_tower() -> None:
-    """Not every search succeeds; random play does in fewer than one episode in a thousand."""
+    """The search topples it on some levels; random play does in fewer than one episode in a thousand."""
     four = take(tower(), np.zeros(4, int))
     searched = search(four, IDS[:4], CONFIG, DEFAULT_RULES)
     assert (searched.success.length > 0).any()
@@ -116,7 +116,7 @@ def test_flag_of_the_caller_leaves_a_search_unchanged() -> None:
 
 
 def test_units_share_search_slots() -> None:
-    """Later levels enter the search slots that others leave; each gives its own result."""
+    """Later levels enter the search slots that others leave; each unit gets the results of its own levels."""
     searching, units = Searching(CONFIG, DEFAULT_RULES), [np.arange(3), np.arange(3, 4), np.arange(4, len(KINDS))]
     assert not searching.step()
     assert searching.wants == AHEAD * side_by_side(CONFIG)

@@ -207,7 +207,7 @@ def test_variation_has_at_least_one_change() -> None:
 
 
 def test_first_of_keeps_the_nearest_trajectories() -> None:
-    """Of several with the same gap the first stays, the others only if there is room."""
+    """Among trajectories with the same gap, the first stays; the others stay only if there is room."""
     gaps = np.array([[0.5, 0.25, 0.5, 0.25, 1.0] + [0.5] * (KEPT - 1)], np.float32)
     count = gaps.shape[1]
     some = Approaches(np.zeros((1, count, 8), np.uint16), gaps, np.arange(count)[None])  # pyright: ignore

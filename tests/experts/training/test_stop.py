@@ -86,7 +86,7 @@ def test_rung_stops_experts_whose_return_has_not_grown() -> None:
 def test_expert_that_never_reaches_the_goal_leaves(
     updates: int, first: int, stopping: StopConfig, leaves: bool
 ) -> None:
-    """It leaves after 20 updates, whatever success it rehearses, at a rung or not."""
+    """The expert leaves after 20 updates, even if it rehearses a success, and whether or not at a rung."""
     stopping = replace(stopping, fruitless=stopping.fruitless and 20_480)
     course, totals = stop.begin()._replace(updates=jnp.int32(updates - 1)), progress.start(16)
     totals, given = totals._replace(first_success=jnp.int32(first)), jnp.bool_(True)

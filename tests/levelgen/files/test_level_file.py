@@ -198,7 +198,7 @@ def test_reader_refuses_a_joint_from_a_body_to_itself() -> None:
     ],
 )
 def test_reader_refuses_unknown_bindings_of_active_actuators(kind: str, binding: int, most: int, names: str) -> None:
-    """Even of a motor that is off and of a fixed joint: a policy reads their bindings."""
+    """A policy reads the bindings of a motor that is off and of a fixed joint, so these are checked, too."""
     for switches in ({}, {"motor_on": False}, {"is_fixed_joint": True}):
         altered = changed(f"env_state.{kind}.0.{names}_binding", binding)
         altered["env_state"][kind][0] |= {"active": True, **(switches if kind == "joint" else {})}

@@ -87,7 +87,7 @@ def test_keys_and_numbers_are_those_of_jax() -> None:
 @pytest.mark.campaign
 @pytest.mark.parametrize("size", ["s", "m"])
 def test_xla_makes_the_same_levels_except_for_the_last_digits(size: str) -> None:
-    """As on a GPU, which does not run our machine code: levels contain the same, and their numbers are nearly equal."""
+    """A GPU runs XLA instead of our machine code: levels have the same parts, and their numbers are nearly equal."""
     ids = jnp.arange(32, dtype=jnp.int32)
     rows, collides = jax.jit(lambda ids: kernel_of(SIZES[size], Distribution()).on_all_lanes(ids, len(ids)))(ids)
     level = sample_levels(ids, size)

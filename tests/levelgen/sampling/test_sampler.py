@@ -141,7 +141,7 @@ def test_small_sizes_have_no_fixed_bodies() -> None:
 
 
 def test_free_bodies_lie_within_the_world(level: Level) -> None:
-    """If nothing joins or lowers them."""
+    """Bodies that no joint holds and that were not lowered lie within the world."""
     model, polygons, numbers = level.model, level.size.polygons, np.arange(level.size.bodies)[:, None, None]
     joined = ((model.joint_a == numbers) | (model.joint_b == numbers)) & model.joint_active
     free = model.active & (model.inverse_mass > 0) & ~joined.any(1)

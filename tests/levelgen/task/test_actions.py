@@ -80,6 +80,6 @@ def test_mask_is_what_active_free_joints_and_active_thrusters_obey(level: Level)
 
 
 def test_mask_counts_motors_that_are_off_or_automatic(level: Level) -> None:
-    """As in the reference, although such an entry has no effect."""
+    """The reference's mask counts them, too, although such an entry has no effect."""
     off = with_model(level, motor_on=jnp.zeros((2, 1), bool))
     np.testing.assert_array_equal(action_mask(off), action_mask(level))

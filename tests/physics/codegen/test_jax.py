@@ -49,7 +49,7 @@ PARAMETERS: dict[str, set[str]] = {
 SINCE = {"stack": (0, 10, 1)}  # primitives that older versions of JAX do without
 CHANGED = (
     f"JAX {jax.__version__} {{}}. Read what changed, mend physics/codegen/lower.py, then write it down here: "
-    "a parameter that nobody reads can change what a primitive means."
+    "a parameter that lower.py does not read can change what a primitive means."
 )
 
 
@@ -115,7 +115,7 @@ def test_unread_parameters_have_their_defaults() -> None:
 
 
 def test_references_are_indexed_as_lower_expects() -> None:
-    """By one indexer of integers, scalars, and slices with start, size and stride."""
+    """Each reference has one indexer of integers, scalars, and slices with start, size and stride."""
     for equation in all_equations():
         if equation.primitive.name in ("get", "swap"):
             operands = equation.invars[1 + (equation.primitive.name == "swap") :]

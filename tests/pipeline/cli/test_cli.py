@@ -164,7 +164,7 @@ def test_generate_does_nothing_when_all_levels_exist(made: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in made.rglob("*") if path.suffix in (".parquet", ".zarr")}
     done = here(["generate", *TINY], made)
     assert done.returncode == 0
-    assert "Nothing to do: 4 levels there already" in done.stdout
+    assert "Nothing to do: the split already has 4 levels" in done.stdout
     assert "levelproof inspect data/5k/s" in done.stdout
     assert before == {path: path.stat().st_mtime_ns for path in made.rglob("*") if path.suffix in (".parquet", ".zarr")}
 
@@ -184,7 +184,7 @@ def test_generate_remakes_a_deleted_fragment_with_the_same_rows(split: Path) -> 
     fragment_paths(split)[1].unlink()
     done = here(["generate", *TINY, "executor=inline"], split.parents[2])
     assert done.returncode == 0, done.stderr
-    assert "3 are there already" in done.stderr
+    assert "3 are already there" in done.stderr
     assert repr(lasting(split)) == repr(before)
 
 
@@ -313,7 +313,9 @@ def test_sealed_split_gives_the_same_answers_and_grows(split: Path, monkeypatch:
     assert "merged 4 fragments into 2; it has 4 levels in 2 fragments now" in done.stdout, done.stderr
     assert answers(split) == before
     assert "there was nothing to seal" in here(["seal", "data/5k/s", "--rows", "3"], folder).stdout
-    assert "Nothing to do: 4 levels there already" in here(["generate", *TINY, "executor=inline"], folder).stdout
+    assert (
+        "Nothing to do: the split already has 4 levels" in here(["generate", *TINY, "executor=inline"], folder).stdout
+    )
     monkeypatch.setattr(seal, "ROWS", 3)
     done = here(["generate", *TINY, "levels=6", "executor=inline"], folder)
     assert done.returncode == 0, done.stderr
@@ -325,7 +327,7 @@ def test_sealed_split_gives_the_same_answers_and_grows(split: Path, monkeypatch:
 
 def test_seal_rejects_invalid_arguments_and_damaged_splits(tmp_path: Path, split: Path) -> None:
     assert_refused(here(["seal", "data/5k/s", "--rows", "0"], tmp_path), 2, "--rows a number from 1")
-    assert_refused(here(["seal", "data/5k/s", "--key-every", "16"], tmp_path), 2, "only --density witness has")
+    assert_refused(here(["seal", "data/5k/s", "--key-every", "16"], tmp_path), 2, "applies only to --density witness")
     with only_writer(split, print):
         assert_refused(here(["seal", "data/5k/s"], tmp_path), 2, "Another", "is writing to data/5k/s")
     shard = split / sorted(read_manifest(split).shards)[0]

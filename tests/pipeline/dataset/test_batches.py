@@ -51,8 +51,8 @@ def test_batches_of_the_two_subsets_are_disjoint(data: Dataset) -> None:
 
 
 def test_batches_yield_all_windows_of_all_trajectories(data: Dataset) -> None:
-    found = items_of(data.batches(16, length=100, **PLAIN))
-    assert sorted(found) == [(i, first) for i in data.manifest["level_id"].to_pylist() for first in (0, 100, 200)]
+    items = items_of(data.batches(16, length=100, **PLAIN))
+    assert sorted(items) == [(i, first) for i in data.manifest["level_id"].to_pylist() for first in (0, 100, 200)]
 
 
 def test_batches_distribute_trajectories_evenly_over_hosts(data: Dataset) -> None:

@@ -13,17 +13,17 @@ from levelproof.pipeline.errors import UserError
 @settings(max_examples=50, deadline=None)
 @given(st.integers(1, 5000), st.integers(0, 2**63), st.integers(0, 10))
 def test_permute_is_a_permutation(count: int, seed: int, epoch: int) -> None:
-    found = permute(np.arange(count), count, seed, epoch)
-    assert np.array_equal(np.sort(found), np.arange(count))
+    permuted = permute(np.arange(count), count, seed, epoch)
+    assert np.array_equal(np.sort(permuted), np.arange(count))
 
 
 def test_permute_computes_single_positions() -> None:
     count = 10**12 + 39
     positions = np.array([0, 1, count // 2, count - 1])
-    found = permute(positions, count, seed=3)
-    assert len(set(found.tolist())) == 4
-    assert ((found >= 0) & (found < count)).all()
-    assert np.array_equal(permute(positions[::-1], count, seed=3), found[::-1])
+    permuted = permute(positions, count, seed=3)
+    assert len(set(permuted.tolist())) == 4
+    assert ((permuted >= 0) & (permuted < count)).all()
+    assert np.array_equal(permute(positions[::-1], count, seed=3), permuted[::-1])
 
 
 def test_permute_looks_random() -> None:

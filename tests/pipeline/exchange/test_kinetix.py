@@ -47,10 +47,10 @@ def test_export_kinetix_keeps_every_bit_of_a_record(split: Path, tmp_path: Path)
     polygons, pairs = SIZES["s"].polygons, len(pairs_of(SIZES["s"]).polygon)
 
     def assert_same(theirs: str, values: np.ndarray) -> None:
-        found = exported[theirs][:, :, 0]
-        want = np.broadcast_to(values, found.shape).astype(values.dtype)
-        assert found.dtype == want.dtype, theirs
-        assert found.tobytes() == want.tobytes(), theirs
+        stored = exported[theirs][:, :, 0]
+        want = np.broadcast_to(values, stored.shape).astype(values.dtype)
+        assert stored.dtype == want.dtype, theirs
+        assert stored.tobytes() == want.tobytes(), theirs
 
     still = lambda name: ours[f"level/{name}"][:, None]
     assert_same("action", ours["record/action"])

@@ -63,7 +63,7 @@ def test_export_parquet_selects_levels_by_where(split: Path, tmp_path: Path, cap
 
 
 def test_export_parquet_omits_levels_that_differ_here(split: Path, tmp_path: Path, capsys, monkeypatch) -> None:
-    """As on a machine with other bits: the content hash in the row differs from that of the regenerated level."""
+    """Simulate a machine with other bits: the content hash in the row differs from that of the regenerated level."""
     first = next(row for row in read_manifest(split).table.to_pylist() if row["label"] == "unsolved")
     real = parquet.content_hashes
     monkeypatch.setattr(parquet, "content_hashes", lambda level: ["other", *real(level)[1:]])

@@ -71,7 +71,7 @@ def require_sound(folder: Path, whole: dict[str, Rows]) -> None:
 
 
 def differences(content: Tree, wanted: Tree) -> str:
-    """Describe the differences for people."""
+    """Describe the differences in sentences."""
     extra, missing = sorted(content.keys() - wanted.keys()), sorted(wanted.keys() - content.keys())
     changed = sorted(name for name in content.keys() & wanted.keys() if content[name] != wanted[name])
     return f"extra: {extra}; missing: {missing}; changed: {changed}"

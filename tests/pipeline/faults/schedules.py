@@ -12,13 +12,13 @@ REGENERATE = ("regenerate", "manifest=OUT/128k/s", "budget=256k", "executor=inli
 
 
 class Operation(NamedTuple):
-    """A command and the state before it; `OUT` stands for the folder or the store's URL."""
+    """A command and the state before it; `OUT` is replaced by the folder or the store's URL."""
 
     words: tuple[str, ...]
     before: tuple[tuple[str, ...], ...] = ()  # commands that run first
     left: bool = False  # add what dead processes leave
-    beside: bool = False  # it seals during the job
-    works: bool = True  # it has a worker
+    beside: bool = False  # the command seals during the job
+    works: bool = True  # the command has a worker
 
 
 OPERATIONS = {

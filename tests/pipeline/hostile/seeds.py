@@ -50,9 +50,9 @@ def seeds(folder: Path) -> Callable[[Random], None]:
                 return
             names = random.sample(NAMES, random.choice((1, 2, len(NAMES))))
             ids = np.array([1, 9]) if random.random() < 0.3 else None
-            found = read_manifest(path, names, ids, compact=random.random() < 0.5)
-            found.table.to_pylist()
-            assert "label" not in names or set(found.table["label"].to_pylist()) <= {*Label}
+            manifest = read_manifest(path, names, ids, compact=random.random() < 0.5)
+            manifest.table.to_pylist()
+            assert "label" not in names or set(manifest.table["label"].to_pylist()) <= {*Label}
             shard = SeedShard(path)
             rows = [row for row, steps in enumerate(shard.steps) if steps][:8]
             if not rows or (shard._source, shard.encoding.rules) != (good._source, good.encoding.rules):

@@ -93,12 +93,12 @@ def level_files(folder: Path) -> Target:
     def target(random: Random) -> None:
         remove(path)
         put(path, mutate_json(document, random), random)
-        found = read_level_file(path)
-        require_possible(arrays_of(found.level, "level/"), found.level.size)
-        assert all(np.isfinite(x).all() for x in arrays_of(found.level).values())
-        assert not any(np.asarray(bad).any() for bad, _, _ in flaws(found.level))
+        level = read_level_file(path)
+        require_possible(arrays_of(level.level, "level/"), level.level.size)
+        assert all(np.isfinite(x).all() for x in arrays_of(level.level).values())
+        assert not any(np.asarray(bad).any() for bad, _, _ in flaws(level.level))
         if random.random() < 0.02:
-            write_level_file(found, folder / "again.json")
+            write_level_file(level, folder / "again.json")
 
     return target
 
@@ -135,9 +135,9 @@ def kinetix_folders(folder: Path) -> Target:
                 put(path, blosc.compress(bytes(decoded), b"zstd", 1, 0), random)
         opened = open_folder(folder / "theirs")
         for array in [array for array in opened.arrays if array.path.name in {name.parts[0] for name in names}]:
-            found = read_trajectories(array, 0, min(array.rows, 3))
-            valid = [i for i, reason in enumerate(found.wrong) if not reason]
-            level = jax.tree.map(lambda x: x[..., valid], found.level)  # noqa: B023
+            trajectories = read_trajectories(array, 0, min(array.rows, 3))
+            valid = [i for i, reason in enumerate(trajectories.wrong) if not reason]
+            level = jax.tree.map(lambda x: x[..., valid], trajectories.level)  # noqa: B023
             require_possible(arrays_of(level, "level/"), opened.size)
             assert all(np.isfinite(x).all() for x in arrays_of(level).values())
 
@@ -169,8 +169,8 @@ def shards(folder: Path, density: str) -> Target:
                 warnings.simplefilter("ignore")  # about a differing engine
                 shard = Shard(path)
                 wanted = stored if random.random() < 0.9 else fields
-                found = shard.read(range(min(2, len(shard.level_ids))), wanted)
-            require_possible(found, shard.size)
+                arrays = shard.read(range(min(2, len(shard.level_ids))), wanted)
+            require_possible(arrays, shard.size)
             assert 0 <= shard.level_ids[0] <= shard.level_ids[-1] <= MAX_LEVEL_ID
         finally:
             remove(path / name)
@@ -230,9 +230,9 @@ def fragments(folder: Path) -> Target:
             fragment, rows = read_fragment(path, None, np.array([1]) if random.random() < 0.3 else None)
             rows.to_pylist()
             changes_text(differences(fragment.config, {}))
-            found = read_manifest(split, ["label", "shard", "experts"], compact=random.random() < 0.5)
-            found.counts(np.ones(len(found.level_ids), bool))
-            assert set(found.labels) <= {*Label}
+            manifest = read_manifest(split, ["label", "shard", "experts"], compact=random.random() < 0.5)
+            manifest.counts(np.ones(len(manifest.level_ids), bool))
+            assert set(manifest.labels) <= {*Label}
 
     return target
 
@@ -276,11 +276,11 @@ def origins(folder: Path) -> Target:
         file = mutate_word(f"{folder}/theirs/{random.choice(('first', 'second'))}#1", random)
         if random.random() < 0.5:
             file = mutate_word(file, random)
-        found = place_of(file)
-        if found is not None:
-            assert str(found) == file
-            opened = open_folder(found.folder)
-            read_trajectories(opened.array(found.array), 0, 1)
+        place = place_of(file)
+        if place is not None:
+            assert str(place) == file
+            opened = open_folder(place.folder)
+            read_trajectories(opened.array(place.array), 0, 1)
 
     return target
 

@@ -292,7 +292,7 @@ def test_crew_hands_on_the_units_of_workers_on_a_refused_machine(monkeypatch: py
 
 
 def test_crew_starts_thousands_of_workers_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that a signal to stop waits for no more than a part."""
+    """The crew polls for a signal to stop between parts, so it waits for no more than one."""
     handles = [cluster.WorkerHandle("a", "a") for _ in range(3000)]
 
     def start(handle: cluster.WorkerHandle, *_: Any) -> None:
@@ -363,7 +363,7 @@ def test_run_survives_machines_that_join_and_leave(tmp_path: Path, machines: Any
     assert f"The experts in {tmp_path / SPLIT / trained['experts']} cannot be read" in note.read_text()
 
     own = run(["generate", "levels=1", "budget=5k", "out=own", "executor=ray"], tmp_path)
-    assert own.returncode == 0, own.stderr  # it ignores a cluster that RAY_ADDRESS does not name
+    assert own.returncode == 0, own.stderr  # the command ignores a cluster that RAY_ADDRESS does not name
 
 
 @pytest.mark.campaign

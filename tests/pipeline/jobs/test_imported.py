@@ -76,7 +76,7 @@ def test_import_labels_levels_by_replaying_the_actions(once: Path) -> None:
         elif whole[i]:
             np.testing.assert_array_equal(kept["record/action"][..., 0], record.action[..., i])
         else:
-            assert "first imported episode, again and again" in row["label_reason"]
+            assert "first imported episode, repeated" in row["label_reason"]
             steps = row["steps_to_goal"]
             np.testing.assert_array_equal(kept["record/action"][:steps, :, 0], record.action[:steps, :, i])
             np.testing.assert_array_equal(kept["record/action"][steps, :, 0], record.action[0, :, i])
@@ -91,7 +91,7 @@ def test_verify_checks_every_imported_level(once: Path, folder: Path) -> None:
         (wrong,) = examine(once / "data/1M/s").wrong  # the unsolved level's world is stored nowhere else
     finally:
         (once / "theirs.gone").rename(once / "theirs")
-    assert "cannot be made again" in wrong
+    assert "cannot be rebuilt" in wrong
 
 
 def test_commands_work_on_an_imported_split(once: Path, tmp_path: Path) -> None:
@@ -161,7 +161,7 @@ def test_import_continues_after_a_stop(once: Path, tmp_path: Path, monkeypatch: 
     assert "run the same command to continue" in done.stderr
     assert read_status(tmp_path / "data/1M/s")["done"] < ROWS == read_status(tmp_path / "data/1M/s")["wanted"]
     done = here(words, tmp_path)
-    assert "1 of 2 units are there already" in done.stderr
+    assert "1 of 2 units are already there" in done.stderr
     want, got = (rows_of(path / "data/1M/s") for path in (once, tmp_path))
     same = [name for name in want[0] if name not in ("shard", "command", "learning_curve")]
     assert [[row[name] for name in same] for row in got] == [[row[name] for name in same] for row in want]
@@ -187,11 +187,11 @@ def test_import_reports_and_skips_invalid_records(once: Path, tmp_path: Path) ->
     assert done.returncode == 0, done.stderr
     assert f"{ROWS - 4} levels of" in done.stdout
     assert "4 were left out." in done.stdout
-    said = [line for line in done.stderr.splitlines() if line.startswith("Left out:")]
-    assert len(said) == module.REPORTED
-    assert "odd/array#1, its actions are not actions of this task." in said[0]
-    assert "#2, its polygon/position has a value that is not a finite 32-bit number." in said[1]
-    assert "#3, its model/joint_a has values out of range for this size." in said[2]
+    messages = [line for line in done.stderr.splitlines() if line.startswith("Left out:")]
+    assert len(messages) == module.REPORTED
+    assert "odd/array#1, its actions are not actions of this task." in messages[0]
+    assert "#2, its polygon/position has a value that is not a finite 32-bit number." in messages[1]
+    assert "#3, its model/joint_a has values out of range for this size." in messages[2]
     assert [row["level_id"] for row in rows_of(tmp_path / "data/1M/s")] == [0, 5, 6]
     assert read_status(tmp_path / "data/1M/s")["wanted"] == ROWS - 4
     want = [rows_of(once / "data/1M/s")[i]["content_hash"] for i in (0, 5, 6)]

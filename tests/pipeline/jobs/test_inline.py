@@ -21,7 +21,7 @@ class Meeting:
     """Programs that compile only in pairs, at the same time; in the place of `Ahead`."""
 
     def __init__(self, stop: Stop | None = None) -> None:
-        """`stop` is asked for once the first pair has met."""
+        """`stop` is requested once the first pair has met."""
         self._met, self._lock, self._stop = Barrier(CORES), Lock(), stop
         self.number, self.compiling = 0, 0.0
 

@@ -67,11 +67,11 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = here(["generate", "level_files=mine", *WORDS], folder)
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr
-    said = done.stderr.splitlines()
-    assert any("copy.json has the same level as" in line and "a.json" in line for line in said)
-    assert any(line.startswith("Cannot use the level file") and "bad.json: it is not JSON" in line for line in said)
-    assert any("rules.json: its rules differ from the job's: set task.frame_skip=4" in line for line in said)
-    assert said[-1] == "2 of the level files in mine were left out, for the reasons above."
+    messages = done.stderr.splitlines()
+    assert any("copy.json has the same level as" in line and "a.json" in line for line in messages)
+    assert any(line.startswith("Cannot use the level file") and "bad.json: it is not JSON" in line for line in messages)
+    assert any("rules.json: its rules differ from the job's: set task.frame_skip=4" in line for line in messages)
+    assert messages[-1] == "2 of the level files in mine were left out, for the reasons above."
     return folder
 
 
@@ -113,7 +113,9 @@ def test_command_of_a_row_labels_its_file_again(once: Path, tmp_path: Path) -> N
     done = here([*shlex.split(row["command"])[1:], "executor=inline"], tmp_path)
     assert done.returncode == 0, done.stderr
     (again,) = lasting(tmp_path / "data/5k/s")
-    assert repr(again) == repr(next(of for of in lasting(once / "data/5k/s") if of["level_id"] == row["level_id"]))
+    assert repr(again) == repr(
+        next(labelled for labelled in lasting(once / "data/5k/s") if labelled["level_id"] == row["level_id"])
+    )
 
 
 def test_verify_checks_every_level_against_its_file(once: Path, folder: Path) -> None:
@@ -151,11 +153,9 @@ def test_level_without_shard_and_file_is_reported_as_lost(tmp_path: Path) -> Non
     assert here(["export", str(split), str(row["level_id"]), "-o", "out.json"], tmp_path).returncode == 0
     assert content_hashes(read_level_file(tmp_path / "out.json").level) == [row["content_hash"]]
     write(tmp_path / "mine", TRIVIAL, "b.json")
-    assert any(
-        "cannot be made again" in text and "no longer contains the level" in text for text in examine(split).wrong
-    )
+    assert any("cannot be rebuilt" in text and "no longer contains the level" in text for text in examine(split).wrong)
     file.unlink()
-    assert any("cannot be made again" in text and "No such file" in text for text in examine(split).wrong)
+    assert any("cannot be rebuilt" in text and "No such file" in text for text in examine(split).wrong)
     assert_refused(
         here(["show", str(split), str(row["level_id"]), "-o", "x.png"], tmp_path), 1, "b.json", "put it back"
     )
@@ -226,7 +226,7 @@ def test_plan_units_group_level_files_whatever_their_ids() -> None:
     origins = {i: Origin(f"c1:{i}", f"{i}.json", "s") for i in range(0, 1000, 100)}
     units = list(plan_units(sorted(origins), {300}, 4, origins))
     assert [len(unit.level_ids) for unit in units] == [4, 4, 1]
-    assert all([of.file for of in unit.origins] == [f"{i}.json" for i in unit.level_ids] for unit in units)
+    assert all([origin.file for origin in unit.origins] == [f"{i}.json" for i in unit.level_ids] for unit in units)
 
 
 @pytest.mark.campaign

@@ -66,10 +66,10 @@ def test_logged_writes_to_the_working_folder_if_the_split_is_in_a_store(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    said: list[str] = []
-    with logged(made_job("data", "log=tensorboard"), Path("s3://bucket/data/128k/s"), said.append) as log:
+    messages: list[str] = []
+    with logged(made_job("data", "log=tensorboard"), Path("s3://bucket/data/128k/s"), messages.append) as log:
         log([BEGAN, STATE])
-    (sentence,) = said
+    (sentence,) = messages
     assert sentence.startswith("Scalars for tensorboard: log/128k/s/")
     logged_values = {name: value for name, _, value in tensorboard_file(tmp_path / "log/128k/s")}
     assert logged_values == pytest.approx(scalars(BEGAN, STATE))
@@ -82,24 +82,24 @@ def test_logged_reports_a_failing_log_once(tmp_path: Path, monkeypatch: pytest.M
 
     name = {"from the first": "__init__", "later": "write", "at the end": "close"}[refuses]
     monkeypatch.setattr(TensorBoardWriter, name, refuse)
-    said: list[str] = []
-    with logged(made_job("data", "log=tensorboard"), tmp_path, said.append) as log:
+    messages: list[str] = []
+    with logged(made_job("data", "log=tensorboard"), tmp_path, messages.append) as log:
         log([BEGAN, STATE])
         log([BEGAN, STATE])
-    assert [line for line in said if "No space left" in line] == [said[-1]]
-    assert said[-1].startswith("Cannot log to tensorboard")
-    assert said[-1].endswith("the run continues without a log.")
+    assert [line for line in messages if "No space left" in line] == [messages[-1]]
+    assert messages[-1].startswith("Cannot log to tensorboard")
+    assert messages[-1].endswith("the run continues without a log.")
 
 
 def test_logged_rejects_a_log_folder_that_is_a_link(tmp_path: Path) -> None:
     for name in ("split", "elsewhere"):
         (tmp_path / name).mkdir()
     (tmp_path / "split/log").symlink_to(tmp_path / "elsewhere")
-    said: list[str] = []
-    with logged(made_job("data", "log=tensorboard"), tmp_path / "split", said.append) as log:
+    messages: list[str] = []
+    with logged(made_job("data", "log=tensorboard"), tmp_path / "split", messages.append) as log:
         log([BEGAN, STATE])
-    assert [text for text in said if "split/log is a link" in text] == said
-    assert len(said) == 1
+    assert [text for text in messages if "split/log is a link" in text] == messages
+    assert len(messages) == 1
     assert not list((tmp_path / "elsewhere").iterdir())
 
 
@@ -126,10 +126,10 @@ def test_tensorboard_and_wandb_read_the_scalars(tmp_path: Path, monkeypatch: pyt
     wandb = pytest.importorskip("wandb")
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
     monkeypatch.setenv("WANDB_MODE", "offline")
-    said = generated(["levels=2", "log=wandb"], tmp_path)
+    log_text = generated(["levels=2", "log=wandb"], tmp_path)
     wandb.teardown()
     (kept,) = (tmp_path / "data/5k/s/log").glob("wandb/offline-run-*/run-*.wandb")
-    assert f"Scalars for wandb: {kept.parent}\n" in said
+    assert f"Scalars for wandb: {kept.parent}\n" in log_text
     assert b"levels/committed" in kept.read_bytes()
     generated(["levels=4", "log=tensorboard"], tmp_path)
     (run,) = (tmp_path / "data/5k/s/log").glob("2*")

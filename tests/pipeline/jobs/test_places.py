@@ -38,15 +38,15 @@ ray.init(address="local", include_dashboard=False, num_cpus=2, num_gpus=1, _memo
 Holder = ray.remote(num_cpus=0, num_gpus=1)(type("Holder", (), {"there": lambda self: True}))
 holder = Holder.remote()
 ray.get(holder.there.remote())
-said = []
+messages = []
 board = Board(Tally(8, 0, 0), Console())
-board.say = said.append
+board.say = messages.append
 cluster.GPU_PATIENCE = 1.0
 crew = cluster.Crew(compose_job(["device=gpu", "unit=1"]), Path("data"), Scheduler([], 8), board)
-assert not crew._gpus and crew._job.device == "cpu", said
+assert not crew._gpus and crew._job.device == "cpu", messages
 crew.follow_cluster()
 assert len(crew._handles) == 1, crew._handles
-gpu, memory = said
+gpu, memory = messages
 assert gpu == "Workers use CPU cores, not GPUs: after 1 s of waiting, others still hold all of them.", gpu
 assert memory.endswith("has 2.0 GB of memory free, and a worker of this size needs 1.5 GB: it runs 1 of 2 workers.")
 crew.start_workers()

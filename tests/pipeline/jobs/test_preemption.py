@@ -34,9 +34,9 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
 
 
 def env_steps(out: str) -> int:
-    found = re.search(r"^([0-9,]+) env steps: ", out, re.MULTILINE)
-    assert found, out
-    return int(found[1].replace(",", ""))
+    match = re.search(r"^([0-9,]+) env steps: ", out, re.MULTILINE)
+    assert match, out
+    return int(match[1].replace(",", ""))
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_same_command_resumes_unfinished_experts(
     assert time.monotonic() - begin < LAST + patience(2)
     assert process.returncode == (-9 if number == signal.SIGKILL else 130), err
     kept = load_paused(split, range(LEVELS), compose_job(SETTINGS))
-    steps = sum(int(of.expert.begun.training.progress.env_steps) for of in kept.values())
+    steps = sum(int(paused.expert.begun.training.progress.env_steps) for paused in kept.values())
     assert steps
     again = run(command, tmp_path)
     assert again.returncode == 0, again.stderr

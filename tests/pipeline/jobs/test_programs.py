@@ -74,7 +74,7 @@ def test_levels_compile_no_program_that_was_compiled_ahead(
     run.finish()
     jax.jit(lambda x: x + len(programs))(ids)
     names = {program.function.__name__ for program in programs}
-    assert compiled, "nobody heard of the program that was compiled just now"
+    assert compiled, "the listener missed the program that was compiled just now"
     assert not names & {name.removeprefix("jit(").removesuffix(")") for name in compiled}
 
 

@@ -118,11 +118,11 @@ def test_generate_deletes_experts_of_a_dead_attempt(folder: Path, tmp_path: Path
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["budget=1M"], "Which levels"),
-        (["manifest=data/8k/s"], "Which budget"),
-        (["manifest=data/8k/s", "budget=1M", "levels=5"], "levels cannot be changed here"),
-        (["manifest=data/8k/s", "budget=1M", "distribution=vehicles"], "distribution cannot be changed here"),
-        (["manifest=data/8k/s", "budget=1M", "distribution.max_size=0.5"], "distribution cannot be changed here"),
+        (["budget=1M"], "The manifest is missing"),
+        (["manifest=data/8k/s"], "The budget is missing"),
+        (["manifest=data/8k/s", "budget=1M", "levels=5"], "levels cannot be changed"),
+        (["manifest=data/8k/s", "budget=1M", "distribution=vehicles"], "distribution cannot be changed"),
+        (["manifest=data/8k/s", "budget=1M", "distribution.max_size=0.5"], "distribution cannot be changed"),
         (["manifest=data/8k/s", "budget=1M", "continue=perhaps"], "continue is perhaps"),
     ],
 )

@@ -107,7 +107,7 @@ def test_command_killed_by_sigkill_continues_to_the_same_bits(undisturbed: Path,
     assert 1 <= len(fragment_paths(tmp_path / SPLIT)) < LEVELS
     done = here([*COMMAND, "executor=inline"], tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "are there already" in done.stderr
+    assert "are already there" in done.stderr
     assert_same_content(tmp_path / SPLIT, undisturbed)
 
 

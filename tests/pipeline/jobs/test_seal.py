@@ -39,23 +39,23 @@ def make(source: Path, split: Path) -> Make:
     def committed(sealer: Sealer, unit: WorkUnit, coming: Collection[WorkUnit]) -> None:
         commit_copy(source, unit.level_ids[0], split)
         sealer.committed(unit)
-        sealer.advance(min((of.level_ids[0] for of in coming), default=None))
+        sealer.advance(min((later.level_ids[0] for later in coming), default=None))
 
     return committed
 
 
 def test_sealer_seals_units_while_others_are_committed(split: Path, make: Make) -> None:
-    said: list[str] = []
+    messages: list[str] = []
     coming = UNITS[2:]
     random.Random(0).shuffle(coming)
-    with sealing(split, read_manifest(split, []).fragments, said.append) as sealer:
+    with sealing(split, read_manifest(split, []).fragments, messages.append) as sealer:
         for i, unit in enumerate(coming):
             make(sealer, unit, coming[i + 1 :])
-            there = {0, 1} | {of.level_ids[0] for of in coming[: i + 1]}
+            there = {0, 1} | {committed.level_ids[0] for committed in coming[: i + 1]}
             assert set(read_manifest(split, []).level_ids.tolist()) == there
     fragments = read_manifest(split).fragments
     assert [(fragment.rows, fragment.sealed) for fragment in fragments] == [(3, True)] * 4
-    assert not said
+    assert not messages
 
 
 def test_sealer_waits_for_running_units_but_not_for_failed_ones(split: Path, make: Make) -> None:
@@ -72,13 +72,13 @@ def test_sealer_waits_for_running_units_but_not_for_failed_ones(split: Path, mak
 
 
 def test_sealer_reports_an_error_once_and_never_ends_the_job(split: Path, make: Make) -> None:
-    said: list[str] = []
+    messages: list[str] = []
     shard = next((split / "shards").iterdir())
     (shard / "act/c/0/0/0").write_bytes(b"x")
-    with sealing(split, read_manifest(split, []).fragments, said.append) as sealer:
+    with sealing(split, read_manifest(split, []).fragments, messages.append) as sealer:
         for i in range(2, len(UNITS)):
             make(sealer, UNITS[i], UNITS[i + 1 :])
-    (sentence,) = said
+    (sentence,) = messages
     assert sentence.startswith(f"Not sealed (The shard {shard} is missing or damaged")
     assert sentence.endswith(f"run `levelproof seal {split}` when this job has ended.")
     assert len(read_manifest(split).level_ids) == len(UNITS)

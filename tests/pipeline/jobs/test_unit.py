@@ -93,9 +93,9 @@ def test_commit_writes_every_field_of_solved_levels_to_the_shard(tmp_path: Path,
     (name,) = read_manifest(tmp_path).shards
     shard = Shard(tmp_path / name)
     assert shard.level_ids == [5, 7]
-    found = shard.read()
+    stored = shard.read()
     for tree, kind, path in ((result.levels, Level, "level/"), (result.record, Record, "record/")):
-        back = arrays_of(tree_of(kind, found, path))
+        back = arrays_of(tree_of(kind, stored, path))
         assert all(same_bits(back[name], values[..., [1, 2]]).all() for name, values in arrays_of(tree).items())
 
 

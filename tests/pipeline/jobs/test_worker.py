@@ -124,7 +124,7 @@ def test_other_worker_makes_returned_and_undecided_levels_to_the_same_bits(tmp_p
     assert kept
     assert back
     assert sorted([*kept.level_ids, *back.level_ids]) == list(unit.level_ids)
-    while sum(of[1] for of in round.totals.values()) < len(kept.level_ids) - 1:
+    while sum(progress[1] for progress in round.totals.values()) < len(kept.level_ids) - 1:
         round = worker.work(Order([]), 0.01)
     worker.stopping = True
     round = worker.work(Order([]), 60.0)
@@ -168,7 +168,7 @@ def test_worker_resumes_experts_that_another_saved(tmp_path: Path, job: JobConfi
     round = worker.work(Order([]), 60.0)
     (path,) = (tmp_path / "kept/checkpoints").iterdir()
     kept = load_paused(tmp_path / "kept", unit.level_ids, job)
-    steps = sum(int(of.expert.begun.training.progress.env_steps) for of in kept.values())
+    steps = sum(int(paused.expert.begun.training.progress.env_steps) for paused in kept.values())
     assert steps
     assert load_paused(tmp_path / "kept", unit.level_ids, replace(job, budget="8k")) == {}
     rest = round.cuts[-1].back
@@ -199,19 +199,19 @@ def test_unreadable_checkpoint_is_fatal(tmp_path: Path, job: JobConfig, mode: in
 def test_failing_unit_fails_alone(tmp_path: Path, job: JobConfig, monkeypatch: pytest.MonkeyPatch, phase: str) -> None:
     works = getattr(worker_module, phase)
     monkeypatch.setattr(worker_module, phase, failing(works, ValueError("of this one"), UNITS[1]))
-    found = outcomes(Worker(job, tmp_path), UNITS)
-    assert {unit for unit in UNITS if found[unit].summary} == {UNITS[0], UNITS[2]}
-    assert found[UNITS[1]].reason.startswith("Traceback")
-    assert found[UNITS[1]].reason.endswith("ValueError: of this one\n")
-    assert not found[UNITS[1]].fatal
+    results = outcomes(Worker(job, tmp_path), UNITS)
+    assert {unit for unit in UNITS if results[unit].summary} == {UNITS[0], UNITS[2]}
+    assert results[UNITS[1]].reason.startswith("Traceback")
+    assert results[UNITS[1]].reason.endswith("ValueError: of this one\n")
+    assert not results[UNITS[1]].fatal
     assert read_manifest(tmp_path).level_ids.tolist() == [0, 1, 2, 4, 5]
 
 
 def test_full_disk_is_fatal(tmp_path: Path, job: JobConfig, monkeypatch: pytest.MonkeyPatch) -> None:
     full = OSError(errno.ENOSPC, "No space left on device")
     monkeypatch.setattr(worker_module, "finish_unit", failing(None, full))
-    found = outcomes(Worker(job, tmp_path), UNITS[1:2])
-    assert found[UNITS[1]].fatal.startswith(f"Cannot write to {tmp_path}, the disk is full")
+    results = outcomes(Worker(job, tmp_path), UNITS[1:2])
+    assert results[UNITS[1]].fatal.startswith(f"Cannot write to {tmp_path}, the disk is full")
 
 
 def test_failing_step_fails_running_units_but_no_later_one(
@@ -219,9 +219,9 @@ def test_failing_step_fails_running_units_but_no_later_one(
 ) -> None:
     advance, worker = pool_module.advance, Worker(job, tmp_path)
     monkeypatch.setattr(pool_module, "advance", failing(advance, MemoryError("no room on the device"), after=2))
-    found = outcomes(worker, UNITS)
-    assert found.keys() == set(UNITS)
-    assert all(of.reason.endswith("MemoryError: no room on the device\n") for of in found.values())
+    results = outcomes(worker, UNITS)
+    assert results.keys() == set(UNITS)
+    assert all(outcome.reason.endswith("MemoryError: no room on the device\n") for outcome in results.values())
     assert not list(tmp_path.rglob("*.parquet"))
     monkeypatch.setattr(pool_module, "advance", advance)
     assert outcomes(worker, UNITS[1:2])[UNITS[1]].summary

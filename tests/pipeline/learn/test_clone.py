@@ -215,13 +215,13 @@ def test_clone_writes_nothing_to_a_folder_that_was_made_again(
 
 def test_copies_of_sealed_levels_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    copies, said = played_split(tmp_path / "copies", copies=SEALED[-16:]), []
+    copies, messages = played_split(tmp_path / "copies", copies=SEALED[-16:]), []
     for _ in range(2):  # hashed, then from the cache folder
-        source = module.source_of(copies, CloneConfig(where="", validation=0.5), said.append)
+        source = module.source_of(copies, CloneConfig(where="", validation=0.5), messages.append)
         others = np.flatnonzero(source.data.manifest["level_id"].to_numpy() >= 16)
         assert 1 < source.copies == len(source.data) - len(others)
         assert sorted([*source.train, *source.validation]) == others.tolist()
-        assert f"{source.copies} levels left out" in said.pop()
+        assert f"{source.copies} levels left out" in messages.pop()
         monkeypatch.setattr("levelproof.pipeline.learn.sealed.content_hashes", None)
     (kept,) = (tmp_path / "cache" / "sealed").iterdir()
     kept.write_text("[]")

@@ -130,7 +130,7 @@ def test_intervals_are_over_levels() -> None:
 
 @pytest.mark.parametrize(("share", "levels"), [(0.02, 30), (0.98, 30), (0.05, 10), (0.4, 100)])
 def test_intervals_hold_the_rate_as_often_as_they_say(share: float, levels: int) -> None:
-    """In samples of levels of which `share` are always solved and the others never."""
+    """Sample levels of which `share` are always solved and the others never."""
     rng = np.random.default_rng(0)
     drawn = np.repeat(rng.random((500, levels, 1)) < share, 4, axis=2)
     held = [low <= share <= high for low, high in map(interval, drawn)]
@@ -143,7 +143,7 @@ def test_interval_of_levels_that_are_alike_contains_their_rate() -> None:
 
 
 def test_worst_tenth_is_rated_on_other_attempts_than_chose_it() -> None:
-    """Of levels that are all alike, the worst tenth is as good as the rest."""
+    """If all levels are alike, the worst tenth is as good as the rest."""
     solved = np.random.default_rng(0).random((4000, 8)) < 0.5
     assert abs(solve_rates(solved, None)["worst"]["rate"] - 0.5) < 0.04
     assert solved[np.argsort(solved.mean(1))[:400]].mean() < 0.25

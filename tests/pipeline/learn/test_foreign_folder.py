@@ -40,9 +40,9 @@ def test_metrics_log_into_no_folder_elsewhere(out: Path, tmp_path: Path) -> None
     pytest.importorskip("tensorboardX")
     (tmp_path / "elsewhere").mkdir()
     (out / LOG).symlink_to(tmp_path / "elsewhere")
-    said: list[str] = []
-    Metrics(out, COURSE, "tensorboard", {}, 0, said.append)
-    assert [text for text in said if "policy/log is a link" in text] == said
+    messages: list[str] = []
+    Metrics(out, COURSE, "tensorboard", {}, 0, messages.append)
+    assert [text for text in messages if "policy/log is a link" in text] == messages
     assert not list((tmp_path / "elsewhere").iterdir())
 
 

@@ -139,19 +139,19 @@ def test_random_levels_are_measured_for_learnability(tmp_path: Path) -> None:
 
 
 def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[str] = []
-    source = levels_for(TrainConfig(levels=str(split), where="label = 'solved'"), said.append)
+    messages: list[str] = []
+    source = levels_for(TrainConfig(levels=str(split), where="label = 'solved'"), messages.append)
     data = levelproof.open(split, where="label = 'solved'")
     assert source.facts["ids"] == data.manifest["level_id"].to_pylist()
     export(split, int(source.facts["ids"][0]), tmp_path / "level.json")
-    of_files = levels_for(TrainConfig(levels=str(tmp_path)), said.append)
+    of_files = levels_for(TrainConfig(levels=str(tmp_path)), messages.append)
     assert of_files.facts["count"] == 1
-    assert not said
+    assert not messages
     first = source.facts["ids"][0]
     monkeypatch.setattr(sealed, "SEALED", range(first, first + 2))
     with pytest.raises(levelproof.UserError, match="sealed to measure policies"):
         levels_for(TrainConfig(levels=str(split), where=""), print)
-    with pytest.raises(levelproof.UserError, match="no level but copies of sealed ones"):
+    with pytest.raises(levelproof.UserError, match="only copies of sealed levels"):
         levels_for(TrainConfig(levels=str(tmp_path)), print)  # their content, whatever their ids
 
 

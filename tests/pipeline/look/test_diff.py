@@ -40,7 +40,7 @@ def split_of(folder: Path, labels: list[Label], budget: str = "64k", steps: int 
 
 @pytest.fixture(scope="module")
 def splits(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Two splits of the same levels: `made_result` makes other levels for another number of them."""
+    """Two splits of the same levels, of one number, because the levels of `made_result` depend on their number."""
     folder = tmp_path_factory.mktemp("data")
     return split_of(folder, [*HERE, U], "64k"), split_of(folder, THERE, "256k", steps=16)
 

@@ -70,8 +70,8 @@ def test_within_handles_100_000_levels() -> None:
     """Every third level is a copy of the one before."""
     contents = [str(i - i % 3 // 2) for i in range(100_000)]
     many = table(*((i, contents[i], f"x{contents[i]}", f"y{contents[i]}") for i in range(100_000)))
-    found = within(many, 2)
-    assert found == {"same": {"levels": 33_333, "pairs": [[2, 1], [5, 4]]}, "near": NONE}
+    duplicates = within(many, 2)
+    assert duplicates == {"same": {"levels": 33_333, "pairs": [[2, 1], [5, 4]]}, "near": NONE}
 
 
 def test_hash_strings_depends_on_the_string_alone() -> None:
@@ -180,5 +180,5 @@ def test_survey_finds_a_planted_handmade_level(handmade: Path, split: Path, tmp_
     assert survey(split, against=[handmade])["against"][str(handmade)] == {"same": NONE, "near": NONE}
     known = next(iter(sorted(handmade.glob("s/*.json"))))
     planted = renumbered(read_level_file(known).level, np.random.default_rng(0))
-    found = survey(committed(tmp_path, [one("s", 0), planted]), against=[handmade])["against"][str(handmade)]
-    assert found == {"same": {"levels": 1, "pairs": [[1, str(known)]]}, "near": NONE}
+    duplicates = survey(committed(tmp_path, [one("s", 0), planted]), against=[handmade])["against"][str(handmade)]
+    assert duplicates == {"same": {"levels": 1, "pairs": [[1, str(known)]]}, "near": NONE}

@@ -145,12 +145,12 @@ def test_solved_by_entities_resamples_levels_from_ids(split: Path, monkeypatch: 
     """No shard is read."""
     monkeypatch.setattr(levels_module, "read_rows", None)
     monkeypatch.setattr(entities, "SAMPLED", 8)
-    found = solved_by_entities(read_manifest(split, ["label"]), np.arange(12))
-    assert (found["looked_at"], found["of"], found["levels"]) == (8, 12, 4)
+    facts = solved_by_entities(read_manifest(split, ["label"]), np.arange(12))
+    assert (facts["looked_at"], facts["of"], facts["levels"]) == (8, 12, 4)
     levels = sample_levels(np.arange(12), SIZES["s"])
     for name, counts in count_entities(levels).items():
-        assert set(found[name]) <= {str(count) for count in counts}
-        assert sum(share["tried"] for share in found[name].values()) == 4
+        assert set(facts[name]) <= {str(count) for count in counts}
+        assert sum(share["tried"] for share in facts[name].values()) == 4
 
 
 def test_inspect_reports_the_rest_without_a_level_file(

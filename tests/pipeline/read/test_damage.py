@@ -81,16 +81,16 @@ def flip(file: Path, random: random.Random) -> None:
     file.write_bytes(content)
 
 
-def damaged_levels(found: Findings) -> set[int]:
-    return {level_id for level_ids in found.wrong.values() for level_id in level_ids}
+def damaged_levels(findings: Findings) -> set[int]:
+    return {level_id for level_ids in findings.wrong.values() for level_id in level_ids}
 
 
-def assert_named(found: Findings, split: Path, file: Path, levels: set[int]) -> None:
+def assert_named(findings: Findings, split: Path, file: Path, levels: set[int]) -> None:
     """Check that only this file's levels are named: all of them, or some if the file stores trajectories."""
-    assert found.sentences
+    assert findings.sentences
     if file.name == JOB:
-        assert f"The file {file} is" in found.sentences[0]
-    named = damaged_levels(found)
+        assert f"The file {file} is" in findings.sentences[0]
+    named = damaged_levels(findings)
     if "c" in file.relative_to(split).parts:
         assert named
         assert named <= levels
@@ -110,11 +110,11 @@ def assert_all_named(
     before = {file: file.read_bytes() for file in some}
     for file in some:
         change(file)
-    found = examine(split)
+    findings = examine(split)
     for file, data in before.items():
         file.write_bytes(data)
-    assert (split / JOB not in some) or any(f"{split / JOB}" in sentence for sentence in found.sentences)
-    named = damaged_levels(found)
+    assert (split / JOB not in some) or any(f"{split / JOB}" in sentence for sentence in findings.sentences)
+    named = damaged_levels(findings)
     assert named <= set[int]().union(*(files[file] for file in some))
     for file in set(some) - {split / JOB}:
         assert named & files[file], file
@@ -192,13 +192,13 @@ def test_examine_finds_each_truncated_lengthened_or_missing_file(kind: str, requ
                 file.unlink()
             else:
                 file.write_bytes(after)
-            found = examine(split)
+            findings = examine(split)
             file.write_bytes(before)
             if file.suffix == ".parquet" and after is None:
-                missing = {i for first, last in found.missing for i in range(first, last + 1)}
-                assert damaged_levels(found) | missing == levels
+                missing = {i for first, last in findings.missing for i in range(first, last + 1)}
+                assert damaged_levels(findings) | missing == levels
             else:
-                assert_named(found, split, file, levels)
+                assert_named(findings, split, file, levels)
 
 
 def exchange(a: Path, b: Path) -> None:
@@ -219,10 +219,10 @@ def test_examine_finds_exchanged_and_extra_files(
     chunks = [min(file for file in shard.glob("*/c/**/*") if file.is_file()) for shard in shards[1:3]]
     for a, b in (shards[:2], fragments[:2], chunks):
         exchange(a, b)
-        found = examine(split)
+        findings = examine(split)
         exchange(a, b)
         levels = set[int]().union(*(ids for file, ids in files.items() if {a, b} & {file, *file.parents}))
-        assert damaged_levels(found) == levels, (a, b)
+        assert damaged_levels(findings) == levels, (a, b)
     (shards[0] / "more").touch()
     assert examine(split).sentences == [
         f"The file {shards[0]}/more is not what was committed ({_hits(files[shards[0] / 'zarr.json'])})."
@@ -243,9 +243,9 @@ def test_examine_finds_missing_files(copied: Callable[[Path], Path], unsealed: P
     shard = next(path for path in sorted((split / "shards").iterdir()) if path.name.startswith(second.stem))
     levels = files[shard / "zarr.json"]
     shutil.rmtree(shard)
-    found = examine(split)
-    assert found.missing == [] or set(range(*found.missing[0])) <= files[first]
-    assert damaged_levels(found) | {i for a, b in found.missing for i in range(a, b + 1)} == files[first] | levels
+    findings = examine(split)
+    assert findings.missing == [] or set(range(*findings.missing[0])) <= files[first]
+    assert damaged_levels(findings) | {i for a, b in findings.missing for i in range(a, b + 1)} == files[first] | levels
     (split / JOB).unlink()
     assert any("the last command requested are unknown" in sentence for sentence in examine(split).sentences)
 

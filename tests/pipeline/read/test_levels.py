@@ -23,9 +23,9 @@ def test_find_level_reads_one_fragment_and_few_columns(tmp_path: Path, monkeypat
         return read_fragment(path, columns, *rest)
 
     monkeypatch.setattr(manifest, "read_fragment", recording)
-    found, row = find_level(split, 5)
+    split_manifest, row = find_level(split, 5)
     assert (row["level_id"], row["row"], row["label"]) == (5, 1, "solved")
-    assert found.config is not None
+    assert split_manifest.config is not None
     assert read == [("000000000004-000000000005", {"level_id", *COLUMNS})]
     read.clear()
     with pytest.raises(UserError, match=r"^There is no level 8 in .*: it has 8 levels, from 0 to 7\.$"):
@@ -38,8 +38,8 @@ def test_find_level_reads_one_fragment_and_few_columns(tmp_path: Path, monkeypat
 def test_rules_of_and_distribution_of_report_settings_of_another_version(
     tmp_path: Path, group: str, read: Callable[[Manifest], Any], settings: Any
 ) -> None:
-    found = read_manifest(made_split(tmp_path, [[Label.SOLVED]]), [])
-    (fragment,) = found.fragments
+    split_manifest = read_manifest(made_split(tmp_path, [[Label.SOLVED]]), [])
+    (fragment,) = split_manifest.fragments
     config = {group: settings} if settings else {}
     with pytest.raises(Failure, match="was made by a levelproof with other settings"):
-        read(replace(found, fragments=(replace(fragment, config=config),)))
+        read(replace(split_manifest, fragments=(replace(fragment, config=config),)))

@@ -36,7 +36,7 @@ def test_levels_of_an_older_split_come_from_its_shards(older: Path) -> None:
     """Levels without a witness are resampled from their ids, and still match half of their signature."""
     manifest = read_manifest(older)
     rows = manifest.table.sort_by("level_id")
-    with pytest.warns(SamplerDiffers, match="sampled by version 1 of the sampler, and here it is version"):
+    with pytest.warns(SamplerDiffers, match="sampled by version 1 of the sampler, but this levelproof has version"):
         levels = levels_of(manifest, rows)
     stored = rows["shard"].is_valid().to_numpy()
     same = np.array(content_hashes(levels)) == rows["content_hash"].to_numpy()

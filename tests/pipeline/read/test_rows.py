@@ -45,16 +45,16 @@ def witnessed(split: Path) -> pa.Table:
 def test_read_rows_keeps_row_order_across_shards(split: Path) -> None:
     rows = witnessed(split).take([7, 0, 3, 1, 6, 0])
     assert len(set(rows["shard"].to_pylist())) == 3
-    found = read_rows(split, rows)
+    batch = read_rows(split, rows)
     for i, row in enumerate(rows.to_pylist()):
         alone = Shard(split / row["shard"]).read([row["row"]])
-        assert found.keys() == alone.keys()
-        assert all(same_bits(found[name][..., i : i + 1], alone[name]).all() for name in alone)
+        assert batch.keys() == alone.keys()
+        assert all(same_bits(batch[name][..., i : i + 1], alone[name]).all() for name in alone)
 
 
 def test_read_rows_returns_only_requested_fields(split: Path) -> None:
-    found = read_rows(split, witnessed(split), ["record/reward", "level/role"])
-    assert {name: x.shape[-1] for name, x in found.items()} == {"record/reward": 8, "level/role": 8}
+    batch = read_rows(split, witnessed(split), ["record/reward", "level/role"])
+    assert {name: x.shape[-1] for name, x in batch.items()} == {"record/reward": 8, "level/role": 8}
 
 
 def test_read_rows_follows_levels_moved_by_a_seal(split: Path) -> None:

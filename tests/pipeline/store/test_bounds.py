@@ -32,14 +32,14 @@ from levelproof.pipeline.store.manifest import read_fragment
 peak = lambda: 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 good, *others = map(Path, sys.argv[1:])
 read_fragment(good)
-before, said = peak(), []
+before, reasons = peak(), []
 for path in others:
     try:
         read_fragment(path)
-        said.append("")
+        reasons.append("")
     except Failure as failure:
-        said.append(str(failure.__cause__))
-print(json.dumps([peak() - before, said]))
+        reasons.append(str(failure.__cause__))
+print(json.dumps([peak() - before, reasons]))
 """
 
 
@@ -161,8 +161,8 @@ def test_read_fragment_refuses_bombs_before_decompressing_them(good: Path, tmp_p
         text=True,
         check=True,
     )
-    grown, said = json.loads(done.stdout)
-    assert said == [*HOSTILE.values()]
+    grown, reasons = json.loads(done.stdout)
+    assert reasons == [*HOSTILE.values()]
     assert grown < MOST
 
 
@@ -170,7 +170,7 @@ def test_read_fragment_survives_lying_size_statistics(good: Path) -> None:
     """With too many numbers in size statistics, pyarrow's `column` raises a C++ exception that ends the process."""
     data = good.read_bytes()
     start, end = footer_of(data).start, footer_of(data).stop
-    lists = [found.end() for found in re.finditer(rb"[\x19\x29\x39]\x26", data[start:end])]  # of two numbers
+    lists = [match.end() for match in re.finditer(rb"[\x19\x29\x39]\x26", data[start:end])]  # of two numbers
     assert len(lists) > 3
     for at in lists:
         footer = data[start : start + at - 1] + b"\x36\x02" + data[start + at : end]

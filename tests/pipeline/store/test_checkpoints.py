@@ -70,7 +70,7 @@ def test_load_experts_accepts_ends_stored_as_a_bool(tmp_path: Path, over: bool) 
 def test_experts_for_skips_experts_that_solved_their_level(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: Source
 ) -> None:
-    """Even if a search replaced the expert's witness. An expert that did not solve its level continues."""
+    """A search may have replaced the expert's witness. An expert that did not solve its level continues."""
     job = made_job("data", *SETTINGS, f"continue_from={tmp_path}")
     experts = {}
     for i, kept in enumerate(some_experts(job)[:2]):

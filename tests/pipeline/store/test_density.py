@@ -154,9 +154,9 @@ def test_read_records_contacts_only_on_request(tmp_path: Path, monkeypatch: Any)
 
 def test_read_together_mixes_densities(tmp_path: Path) -> None:
     full, resumed, witness = (write(tmp_path, Encoding(density)) for density in ("full", "resume", "witness"))
-    found = read_together([(witness, [1]), (full, [0, 3]), (resumed, [2]), (witness, [2])])
+    arrays = read_together([(witness, [1]), (full, [0, 3]), (resumed, [2]), (witness, [2])])
     assert_same(
-        {name: np.moveaxis(x, 0, -1) for name, x in found.items()},
+        {name: np.moveaxis(x, 0, -1) for name, x in arrays.items()},
         {name: x[..., [1, 0, 3, 2, 2]] for name, x in played().items()},
     )
 
@@ -184,13 +184,13 @@ def test_read_warns_of_differing_states_and_resets_at_key_frames(tmp_path: Path,
     shard = changed(write(tmp_path, WITNESS), lambda stored: ulp(stored, "key/state/position", 0, level))
     for fields in (None, ["record/state/position"]):  # with any request
         with pytest.warns(EngineDiffers, match=rf"1 of 4 levels of the shard .*, {warning}"):
-            found = shard.read(fields=fields)["record/state/position"]
-        differs = found.view(np.uint32) != here.view(np.uint32)
+            positions = shard.read(fields=fields)["record/state/position"]
+        differs = positions.view(np.uint32) != here.view(np.uint32)
         assert not np.delete(differs, level, -1).any()
         assert not differs[:row].any()
         assert differs[row].sum() == 1  # the key frame is returned as stored
         assert differs[row + 1 :].any()  # and the engine continues from it
-        np.testing.assert_allclose(found[row + 1], here[row + 1], atol=1e-4)
+        np.testing.assert_allclose(positions[row + 1], here[row + 1], atol=1e-4)
     assert shard.unlike([0, 1, 2, 3]).tolist() == [row if i == level else -1 for i in range(4)]
     shard.read([level], ["record/done"])  # no simulation, no warning
 
@@ -378,9 +378,9 @@ def test_convert_writes_a_few_levels_at_a_time(tmp_path: Path, monkeypatch: pyte
     witness, full = write(tmp_path, WITNESS), write(tmp_path, Encoding())
     places = [Place(shard.path, row, IDS[row]) for shard, row in ((full, 0), (witness, 1), (witness, 2))]
     paths = iter(tmp_path / f"{i}.zarr" for i in range(9))
-    found = list(seal.convert(places, "resume", 32, lambda: next(paths)))
-    assert [[place.level_id for place in group] for group in found] == [IDS[:2], IDS[2:3]]
-    for place in (place for group in found for place in group):
+    converted = list(seal.convert(places, "resume", 32, lambda: next(paths)))
+    assert [[place.level_id for place in group] for group in converted] == [IDS[:2], IDS[2:3]]
+    for place in (place for group in converted for place in group):
         shard = Shard(place.shard)
         assert (shard.encoding.density, shard.level_ids[place.row]) == ("resume", place.level_id)
         i = IDS.index(place.level_id)

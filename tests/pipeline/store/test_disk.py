@@ -59,7 +59,9 @@ def kept_experts() -> dict[int, KeptExpert]:
     return {0: KeptExpert(jax.tree.map(lambda x: np.zeros(x.shape[1:], x.dtype), begun), [0.0])}
 
 
-@pytest.mark.parametrize(("code", "words"), [(errno.ENOSPC, "the disk is full: free"), (errno.EIO, "the disk fails")])
+@pytest.mark.parametrize(
+    ("code", "words"), [(errno.ENOSPC, "the disk is full: free"), (errno.EIO, "the disk reports an error")]
+)
 def test_explaining_writes_turns_failed_writes_into_sentences(tmp_path: Path, code: int, words: str) -> None:
     with (
         pytest.raises(Failure, match=f"^Cannot write to {tmp_path}, {words}.* same command again"),

@@ -137,7 +137,7 @@ def test_content_of_other_lengths_is_refused(good: Path, tmp_path: Path) -> None
         with_setting("distribution", "files")(columns, about)
         columns["content"] = [b"short"] * len(columns["level_id"])
 
-    assert "its content is not that of levels of size s" in refused(rewrite(good, tmp_path / "x.parquet", change))
+    assert "it does not contain levels of size s" in refused(rewrite(good, tmp_path / "x.parquet", change))
 
 
 def test_compressed_bombs_are_refused_before_they_are_unpacked(good: Path, tmp_path: Path) -> None:
@@ -173,7 +173,7 @@ def test_lengths_that_lie_are_refused(good: Path, tmp_path: Path) -> None:
 
 def test_unpacking_random_bytes_gives_actions_or_one_error() -> None:
     rng = np.random.default_rng(0)
-    found, refusals = 0, set()
+    unpacked, refusals = 0, set()
     for _ in range(1000):
         packed = [bytes(rng.integers(0, rng.choice([8, 30, 256]), rng.integers(0, 6)).astype(np.uint8))] * 2
         try:
@@ -181,9 +181,9 @@ def test_unpacking_random_bytes_gives_actions_or_one_error() -> None:
         except ValueError as error:
             refusals.add(str(error))
             continue
-        found += 1
+        unpacked += 1
         assert ((action >= 0) & (action < np.array(CHOICES)[:, None])).all()
-    assert found
+    assert unpacked
     assert all(sentence.startswith("its witnesses ") for sentence in refusals)
 
 
@@ -191,6 +191,6 @@ def test_commands_end_in_one_sentence(good: Path, tmp_path: Path, capsys: pytest
     path = rewrite(good, tmp_path / "levels.parquet", CHANGES["made with a nest"])
     for words in (["inspect", str(path)], ["verify", str(path)], ["grow", str(path), "-o", str(tmp_path / "128k/s")]):
         assert main(words) != 0
-        said = capsys.readouterr()
-        assert "Traceback" not in said.err
-        assert "The seed file" in said.out + said.err
+        captured = capsys.readouterr()
+        assert "Traceback" not in captured.err
+        assert "The seed file" in captured.out + captured.err

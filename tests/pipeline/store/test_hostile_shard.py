@@ -299,7 +299,7 @@ def test_commands_refuse_hostile_shards_in_one_sentence(tmp_path: Path, capsys: 
 
 
 def test_commands_do_not_leave_the_split(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Not even to measure folder sizes."""
+    """Commands that measure folder sizes do not leave it, either."""
     split = made_split(tmp_path / "data", [[Label.SOLVED]])
     (tmp_path / "secret").write_bytes(b"x" * 1000)
     (path,) = fragment_paths(split)

@@ -51,12 +51,12 @@ def dead(split: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 def test_commit_skips_levels_of_an_unreported_commit(tmp_path: Path) -> None:
     """An attempt returned some of its levels, but its report was lost, so the whole unit was assigned again."""
-    said: list[str] = []
+    messages: list[str] = []
     for ids in [[0, 3], [0, 1, 2, 3], [0, 1, 2, 3]]:
         commit(made_job(), tmp_path, WorkUnit(tuple(ids)), made_result(ids, [Label.SOLVED] * len(ids)))
-    assert clean(tmp_path, said.append).level_ids.tolist() == [0, 1, 2, 3]
+    assert clean(tmp_path, messages.append).level_ids.tolist() == [0, 1, 2, 3]
     assert [path.stem for path in fragment_paths(tmp_path)] == [unit_name(0, 3), unit_name(1, 2)]
-    assert not said, "a shard that no fragment names"
+    assert not messages, "a shard that no fragment names"
 
 
 def everything(split: Path) -> set[Path]:
@@ -64,21 +64,21 @@ def everything(split: Path) -> set[Path]:
 
 
 @pytest.fixture
-def said() -> list[str]:
+def messages() -> list[str]:
     return []
 
 
-def test_clean_removes_what_a_dead_attempt_left(split: Path, dead: str, said: list[str]) -> None:
+def test_clean_removes_what_a_dead_attempt_left(split: Path, dead: str, messages: list[str]) -> None:
     note = split / "quarantine/.000000000004-000000000005.txt.123"
     note.parent.mkdir()
     half = {split / ".job.json.123", split / "manifest/.index.txt.123", note}
     for path in half:
         path.touch()
     before = everything(split)
-    assert clean(split, said.append).level_ids.tolist() == [0, 1]
+    assert clean(split, messages.append).level_ids.tolist() == [0, 1]
     gone = {path for path in before if dead in path.as_posix()} | half
     assert everything(split) == before - gone
-    assert not said
+    assert not messages
 
 
 @pytest.mark.usefixtures("dead")
@@ -108,15 +108,15 @@ def test_clean_keeps_files_of_others(split: Path, tmp_path_factory: pytest.TempP
     assert (elsewhere / "mine").exists()
 
 
-def test_clean_reports_unnamed_data_without_a_mark(split: Path, said: list[str]) -> None:
+def test_clean_reports_unnamed_data_without_a_mark(split: Path, messages: list[str]) -> None:
     committed(split, 2)
     moved = fragment_paths(split)[0]
     (shard,) = (split / "shards").glob(f"{moved.stem}-*")
     moved.rename(split / "kept.parquet")
     before = everything(split)
-    assert clean(split, said.append).level_ids.tolist() == [2, 3]
+    assert clean(split, messages.append).level_ids.tolist() == [2, 3]
     assert everything(split) == before
-    (sentence,) = said
+    (sentence,) = messages
     assert f"No fragment names {shard}: delete" in sentence
 
 

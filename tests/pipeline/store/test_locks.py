@@ -42,7 +42,7 @@ def test_committing_is_shared(tmp_path: Path) -> None:
 
 
 def test_committing_refuses_workers_of_an_earlier_writer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not even to a folder that was deleted and created again."""
+    """A folder that was deleted and created again does not let them commit, either."""
     monkeypatch.setattr(leases, "_served", {})
     worker = Path(os.path.relpath(tmp_path))  # another process may know it by this path
     with only_writer(tmp_path, print):
@@ -105,18 +105,18 @@ def test_locks_exclude_on_nfs_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert not is_written(tmp_path)
     with only_writer(tmp_path, print):
         pass
-    said: list[str] = []
+    messages: list[str] = []
     with held_elsewhere("committing", tmp_path) as worker:
 
         def then_end_it(text: str) -> None:
-            said.append(text)
+            messages.append(text)
             worker.communicate()
 
         with committing(tmp_path):
             pass
         with without_commits(tmp_path, then_end_it):
             assert worker.returncode == 0
-    assert len(said) == 1
+    assert len(messages) == 1
 
 
 @pytest.mark.parametrize("refused", [fcntl.LOCK_SH, fcntl.LOCK_EX])

@@ -218,9 +218,9 @@ def test_read_manifest_opens_only_fragments_that_cover_the_levels(
         ([], [], []),
     ):
         opened.clear()
-        found = read_manifest(tmp_path, ["label"], level_ids)
-        assert found.level_ids.tolist() == rows
+        manifest = read_manifest(tmp_path, ["label"], level_ids)
+        assert manifest.level_ids.tolist() == rows
         assert sorted(opened) == sorted(paths[unit] for unit in units)
     with pytest.raises(KeyError):
-        _ = found.shards  # not read, so unknown instead of empty
+        _ = manifest.shards  # not read, so unknown instead of empty
     assert require_manifest(tmp_path, [], [8]).table.num_rows == 0

@@ -45,10 +45,10 @@ def kept() -> dict[int, Paused]:
         begun = filled(like)
         course = begun.training.course._replace(updates=np.asarray(updates, np.int32))
         begun = begun._replace(training=begun.training._replace(course=course))
-        found = nothing_found(1)._replace(source=[Source.SEARCH], search_steps=np.array([5]))
+        findings = nothing_found(1)._replace(source=[Source.SEARCH], search_steps=np.array([5]))
         pending = Pending(np.bool_(True), np.bool_(False), np.int32(9))
         return Paused(
-            KeptExpert(begun, [0.5] * updates), pending, 3, [filled(shown) for _ in range(evaluations)], found
+            KeptExpert(begun, [0.5] * updates), pending, 3, [filled(shown) for _ in range(evaluations)], findings
         )
 
     return {3: one(2, 0), 7: one(5, 2)}
@@ -102,19 +102,19 @@ def test_load_paused_ignores_damaged_checkpoints(split: Path) -> None:
 def test_prune_removes_checkpoints_of_committed_levels(split: Path) -> None:
     path = checkpoint_path(split, UNIT)
     (split / "checkpoints" / f".{path.name}.17").touch()
-    said: list[str] = []
-    prune_paused(split, np.array([7]), said.append)
+    messages: list[str] = []
+    prune_paused(split, np.array([7]), messages.append)
     assert [entry.name for entry in path.parent.iterdir()] == [path.name]
-    prune_paused(split, np.array([3, 7, 8]), said.append)
+    prune_paused(split, np.array([3, 7, 8]), messages.append)
     assert not list(path.parent.iterdir())
-    assert not said
+    assert not messages
 
 
 def pruned(split: Path, *done: int) -> list[str]:
     """Return what `prune_paused` reports about the only checkpoint."""
-    said: list[str] = []
-    prune_paused(split, np.array(done), said.append)
-    return said
+    messages: list[str] = []
+    prune_paused(split, np.array(done), messages.append)
+    return messages
 
 
 def test_save_replaces_no_checkpoint_for_an_earlier_writer(split: Path, kept: dict[int, Paused]) -> None:
@@ -146,8 +146,8 @@ def test_save_keeps_other_users_out_under_any_umask(tmp_path: Path, kept: dict[i
 def test_prune_keeps_a_checkpoint_that_others_can_write_to(split: Path, kept: dict[int, Paused]) -> None:
     path = checkpoint_path(split, UNIT)
     path.chmod(0o664)
-    (said,) = pruned(split, 7)
-    assert f"{path} cannot be read (Other users can write to {path}" in said
+    (message,) = pruned(split, 7)
+    assert f"{path} cannot be read (Other users can write to {path}" in message
     with pytest.raises(CheckpointUnread, match="make it readable, or remove it to train its experts from the start"):
         load_paused(split, range(8), JOB)
     path.chmod(0o600)
@@ -169,8 +169,8 @@ def test_prune_removes_and_reports_a_damaged_checkpoint(split: Path) -> None:
         whole.replace(b'"bytes": ', b'"bytes": 1e999, "was": '),
     ):
         path.write_bytes(damaged)
-        (said,) = pruned(split, 7)
-        assert f"{path} is damaged (" in said
+        (message,) = pruned(split, 7)
+        assert f"{path} is damaged (" in message
         assert not path.exists()
 
 
@@ -226,8 +226,8 @@ def test_checkpoints_in_a_store_survive_time_outs(
         server.spoil(1 if ".paused" in server.log[-1] else 0)
 
     server.meanwhile = silent_of_the_file
-    (said,) = pruned(split, 7)
-    assert "cannot be read (Cannot read s3://bucket/data/5k/s/checkpoints/" in said
+    (message,) = pruned(split, 7)
+    assert "cannot be read (Cannot read s3://bucket/data/5k/s/checkpoints/" in message
     with pytest.raises(StoreFailure):
         load_paused(split, range(8), JOB)
     server.meanwhile = lambda _: server.spoil(0)

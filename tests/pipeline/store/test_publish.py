@@ -357,12 +357,12 @@ def test_lease_of_a_silent_writer_is_taken_and_the_writer_notices(
     monkeypatch.setattr(leases, "SILENCE", 0.3)
     monkeypatch.setattr(leases, "NOTICE", 0.1)
     monkeypatch.setattr(leases, "RENEWAL", patience(2.0))
-    said, theirs = list[str](), list[Lease]()
+    messages, theirs = list[str](), list[Lease]()
     with pytest.raises(LeaseLost), leases.leased(THERE, print):  # noqa: PT012
-        theirs.append(Lease(THERE, said.append))
+        theirs.append(Lease(THERE, messages.append))
         time.sleep(patience(30))  # until the loss of the lease interrupts it
     theirs[0].release()
-    (sentence,) = said
+    (sentence,) = messages
     assert "still writes to s3://bucket/data/128k/s: after 0 s" in sentence
 
 
@@ -377,21 +377,21 @@ def left_by_a_killed_writer(**other: Any) -> bytes:
 def test_lease_of_a_dead_process_is_taken_at_once_on_its_machine_only(
     server: Server, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Not on another machine with the same host name, which outside of containers has the same PID namespace, too."""
+    """Another machine with the same host name waits, although PID namespaces outside of containers are equal, too."""
     monkeypatch.setattr(leases, "NOTICE", 0.0)
-    said: list[str] = []
+    messages: list[str] = []
     put(THERE / WRITER_LOCK, left_by_a_killed_writer())
-    Lease(THERE, said.append).release()
-    assert not said
+    Lease(THERE, messages.append).release()
+    assert not messages
     monkeypatch.setattr(leases, "SILENCE", 0.3)
     for boot_id in ("a55af8d1-3d1c-4b2c-8a5e-5f0c2a9b0001", None):  # of the other machine; None: unknown
         put(THERE / WRITER_LOCK, left_by_a_killed_writer())
         with monkeypatch.context() as elsewhere:
             (tmp_path / "boot_id").write_text(boot_id or "")
             elsewhere.setattr(machine, "BOOT_ID", tmp_path / ("boot_id" if boot_id else "none"))
-            said.clear()
-            Lease(THERE, said.append).release()
-        (sentence,) = said
+            messages.clear()
+            Lease(THERE, messages.append).release()
+        (sentence,) = messages
         assert "still writes to s3://bucket/data/128k/s" in sentence
 
 
@@ -459,22 +459,22 @@ def test_is_leased_compares_no_clocks(
     """Neither the store's, which dates the lease by `day`, nor this machine's."""
     monkeypatch.setattr(leases, "RENEWAL", 0.1)
     monkeypatch.setattr(leases, "NOTICE", 0.0)
-    said = list[str]()
+    messages = list[str]()
     with on_a_day(day, tmp_path / "s3") as patched:
-        assert not is_written(THERE, said.append)
+        assert not is_written(THERE, messages.append)
         with leases.leased(THERE, print):
             assert is_written(THERE, print)
-        assert not is_written(THERE, said.append)
+        assert not is_written(THERE, messages.append)
         put(THERE / WRITER_LOCK, left_by_a_killed_writer())
-        assert not is_written(THERE, said.append)
+        assert not is_written(THERE, messages.append)
         for text in (json.dumps({"writer": "a folder's, copied here"}).encode(), b"[" * leases.MAX_BYTES):
             put(THERE / WRITER_LOCK, text)
-            assert not is_written(THERE, said.append)
-        assert not said, "each of these is known at once"
+            assert not is_written(THERE, messages.append)
+        assert not messages, "each of these is known at once"
         put(THERE / WRITER_LOCK, left_by_a_killed_writer(within="another machine"))
         patched.setattr(leases, "WATCH", 0.3)
-        assert not is_written(THERE, said.append)
-        assert said == ["Checking whether a run still writes to s3://bucket/data/128k/s, which takes up to 0 s."]
+        assert not is_written(THERE, messages.append)
+        assert messages == ["Checking whether a run still writes to s3://bucket/data/128k/s, which takes up to 0 s."]
 
 
 @pytest.mark.parametrize(("every", "how"), [(0, ""), (2, "lost")])

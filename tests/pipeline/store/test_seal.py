@@ -85,9 +85,9 @@ def test_seal_preserves_rows_and_bits(split: Path, made: Path, rows: int, fragme
     assert_tidy(split, fragments)
     assert all(fragment.sealed for fragment in read_manifest(split).fragments)
     assert plan(pieces(split), rows) == []
-    said: list[str] = []
-    clean(split, said.append)
-    assert not said
+    messages: list[str] = []
+    clean(split, messages.append)
+    assert not messages
     assert_tidy(split, fragments)
 
 
@@ -152,7 +152,7 @@ def test_units_commit_into_the_range_of_a_seal(split: Path, made: Path, monkeypa
         seal(split, pieces(split))
     assert whole(split) == expected
     assert len(fragment_paths(split)) == 2
-    seal(split, pieces(split))  # it has the range of the earlier one and replaces it
+    seal(split, pieces(split))  # the new fragment has the range of the earlier one and replaces it
     assert whole(split) == expected
     assert_tidy(split, 1)
 
@@ -317,7 +317,7 @@ class Stopped(Exception):
 
 @pytest.mark.parametrize(("committed", "left"), [(False, 0), (True, UNITS + 1), (True, 1)])
 def test_seal_stopped_at_any_file_loses_nothing(split: Path, made: Path, committed: bool, left: int) -> None:
-    """Before its commit; or after it, before it removes the first of `left` fragments or, with one left, a shard."""
+    """Stop the seal before its commit, or after it with `left` fragments: before it removes one or, if last, shards."""
     fragment, asked = fragment_path(split, unit_name(0, 2 * UNITS - 1)), 0
     shards = len(list((split / "shards").iterdir()))
 
@@ -325,7 +325,7 @@ def test_seal_stopped_at_any_file_loses_nothing(split: Path, made: Path, committ
         nonlocal asked
         asked += not count  # before a file is opened or removed, no chunk has moved
         ready = fragment.exists() and len(fragment_paths(split)) == left
-        if ready if committed else asked > UNITS:  # it has read all fragments by then
+        if ready if committed else asked > UNITS:  # the seal has read all fragments by then
             raise Stopped
 
     with pytest.raises(Stopped):

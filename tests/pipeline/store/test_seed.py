@@ -63,10 +63,10 @@ def test_witnesses_unpack_to_the_actions_that_were_packed() -> None:
     rng = np.random.default_rng(0)
     episodes = [episode(rng) for _ in range(200)]
     packed, steps = [pack_witness(one, ALL) for one in episodes], np.array([len(one) for one in episodes])
-    found = unpack_witnesses(packed, steps)
+    unpacked = unpack_witnesses(packed, steps)
     for i, one in enumerate(episodes):
-        np.testing.assert_array_equal(found[: len(one), :, i], one)
-        assert not found[len(one) :, :, i].any()
+        np.testing.assert_array_equal(unpacked[: len(one), :, i], one)
+        assert not unpacked[len(one) :, :, i].any()
 
 
 def test_the_ten_lines_of_the_guide_decode_a_witness() -> None:
@@ -81,8 +81,8 @@ def test_the_ten_lines_of_the_guide_decode_a_witness() -> None:
 
 def test_pack_witness_drops_dead_entries() -> None:
     live = np.arange(len(CHOICES)) == 4
-    found = unpack_witnesses([pack_witness(np.ones((9, 6), int), live)], np.array([9]))
-    assert found[:9, :, 0].tolist() == [[0, 0, 0, 0, 1, 0]] * 9
+    unpacked = unpack_witnesses([pack_witness(np.ones((9, 6), int), live)], np.array([9]))
+    assert unpacked[:9, :, 0].tolist() == [[0, 0, 0, 0, 1, 0]] * 9
 
 
 def test_worlds_unpack_to_every_bit_of_the_level() -> None:

@@ -75,8 +75,8 @@ def test_same_bits_distinguishes_signed_zeros_and_accepts_nan() -> None:
 
 def test_read_opens_only_arrays_of_requested_fields(shard: Path, fields: dict[str, np.ndarray]) -> None:
     (shard / "dyn32/c/0/0/0").unlink()  # not needed below
-    found = Shard(shard).read(fields=["record/action", "level/role"])
-    assert_same(found, {name: fields[name] for name in ("level/role", "record/action")})
+    stored = Shard(shard).read(fields=["record/action", "level/role"])
+    assert_same(stored, {name: fields[name] for name in ("level/role", "record/action")})
 
 
 def test_shards_are_plain_zarr(shard: Path) -> None:

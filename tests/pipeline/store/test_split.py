@@ -59,7 +59,7 @@ def test_writing_refuses_another_density(tmp_path: Path, job: JobConfig) -> None
     words = ["density=witness", "key_every=16"]
     assert_refused(
         made_job(str(tmp_path / "data"), *words),
-        "has density=full, but this command asks for density=witness key_every=16: use",
+        "has density=full, but this command sets density=witness key_every=16: use",
     )
 
 

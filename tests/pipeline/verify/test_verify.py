@@ -104,11 +104,11 @@ def test_examine_finds_nothing_wrong_in_an_honest_split(honest: Path, monkeypatc
     counts: list[int] = []
     counted = lambda level, action, rules: counts.append(action.shape[-1]) or replay(level, action, rules)
     monkeypatch.setattr(evidence, "replay", counted)
-    found = examine(honest)
-    assert found.sentences == []
-    assert (found.levels, found.shards) == (UNIT * UNITS, len(read_manifest(honest).shards))
-    assert found.witnesses == found.same_bits == len(rows_labelled(honest, *WITNESSED))
-    assert counts == [found.witnesses]
+    findings = examine(honest)
+    assert findings.sentences == []
+    assert (findings.levels, findings.shards) == (UNIT * UNITS, len(read_manifest(honest).shards))
+    assert findings.witnesses == findings.same_bits == len(rows_labelled(honest, *WITNESSED))
+    assert counts == [findings.witnesses]
 
 
 def test_examine_checks_a_split_on_a_web_server(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -117,9 +117,9 @@ def test_examine_checks_a_split_on_a_web_server(split: Path, tmp_path: Path, mon
     write_index(split)
     shard = split / sorted(read_manifest(split, ["shard"]).shards)[0]
     with serving(files_of(split.parent)) as server:
-        found = examine(Path(f"{server.url}/{split.name}"))
-        assert found.sentences == []
-        assert found.witnesses == found.same_bits == len(rows_labelled(split, *WITNESSED))
+        findings = examine(Path(f"{server.url}/{split.name}"))
+        assert findings.sentences == []
+        assert findings.witnesses == findings.same_bits == len(rows_labelled(split, *WITNESSED))
         with (shard / "zarr.json").open("a") as file:
             file.write(" ")
         (sentence,) = examine(Path(f"{server.url}/{split.name}")).sentences
@@ -255,10 +255,10 @@ def test_examine_reports_a_hostile_shard_once_and_checks_the_others(split: Path)
     shutil.rmtree(shard.path)
     write_shard(shard.path, shard.level_ids, arrays)
     forge(split)
-    found = examine(split)
-    (sentence,) = found.sentences
+    findings = examine(split)
+    (sentence,) = findings.sentences
     assert "its field level/model/joint_a has numbers that size s cannot have" in sentence
-    assert 0 < found.witnesses == len(rows_labelled(split, *WITNESSED)) - len(shard.level_ids)
+    assert 0 < findings.witnesses == len(rows_labelled(split, *WITNESSED)) - len(shard.level_ids)
     for name in ("/etc", "../../elsewhere", row["shard"]):
         if name == row["shard"]:
             shutil.rmtree(split / "shards")

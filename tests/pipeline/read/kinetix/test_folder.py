@@ -38,12 +38,12 @@ def test_read_trajectories_accepts_any_chunk_shape(size: str) -> None:
     first, second = folder.arrays
     assert (first.chunks, second.chunks) == ((4, 256), (2, 100))
     for array, start, stop, offset in ((first, 0, 3, 0), (second, 1, 4, first.rows), (second, 3, 4, first.rows)):
-        found = read_trajectories(array, start, stop)
+        trajectories = read_trajectories(array, start, stop)
         at = slice(offset + start, offset + stop)
-        assert found.wrong == [""] * (stop - start)
-        np.testing.assert_array_equal(found.action, record.action[..., at])
-        np.testing.assert_array_equal(found.level.state.position, level.state.position[..., at])
-        np.testing.assert_array_equal(found.level.model.vertices, level.model.vertices[..., at])
+        assert trajectories.wrong == [""] * (stop - start)
+        np.testing.assert_array_equal(trajectories.action, record.action[..., at])
+        np.testing.assert_array_equal(trajectories.level.state.position, level.state.position[..., at])
+        np.testing.assert_array_equal(trajectories.level.model.vertices, level.model.vertices[..., at])
 
 
 def changed(**entries: Any) -> Callable[[Path], None]:
