@@ -3,6 +3,10 @@
 import os
 import re
 import socket
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from levelproof.pipeline.errors import Failure, LevelproofError, UserError
 
@@ -47,3 +51,17 @@ def cannot_start(error: Exception) -> LevelproofError | None:
     if isinstance(error, OSError):
         return Failure(f"Ray cannot start ({error}): fix that, or set RAY_TMPDIR to another folder.")
     return None
+
+
+@contextmanager
+def noticing_slow_starts(seconds: float) -> Iterator[None]:
+    """Tell the user if the `with` block, in which Ray starts or connects, lasts longer: Ray has no time limit."""
+    where = f"the cluster at RAY_ADDRESS={ray_address()}" if ray_address() else "Ray on this machine"
+    words = f"Still waiting for {where} to answer: `ray status` says how it is; Ctrl-C stops."
+    notice = threading.Timer(seconds, print, (words,), {"file": sys.stderr, "flush": True})
+    notice.daemon = True
+    notice.start()
+    try:
+        yield
+    finally:
+        notice.cancel()

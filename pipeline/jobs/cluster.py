@@ -31,7 +31,7 @@ from levelproof.configs.schema import JobConfig
 from levelproof.levelgen.level import size_of
 from levelproof.pipeline.errors import Failure, last_line
 from levelproof.pipeline.jobs.actor import WorkerActor
-from levelproof.pipeline.jobs.address import cannot_start, ray_address, require_reachable
+from levelproof.pipeline.jobs.address import cannot_start, noticing_slow_starts, ray_address, require_reachable
 from levelproof.pipeline.jobs.likeness import program_of, with_absolute_paths
 from levelproof.pipeline.jobs.places import bytes_of_worker, memory_to_reserve, shortage, workers_by_machine
 from levelproof.pipeline.jobs.progress import STOPPING, Board, Meters
@@ -322,6 +322,17 @@ class Crew:
 
 
 @contextmanager
+def _listening_on_loopback(alone: bool) -> Iterator[None]:
+    """Have a Ray that starts in the `with` block listen on loopback if it is `alone`, else on the network."""
+    before = ray_constants.ENABLE_RAY_CLUSTER
+    ray_constants.ENABLE_RAY_CLUSTER = not alone
+    try:
+        yield
+    finally:  # of later clusters of this process, a test's for one, the caller decides
+        ray_constants.ENABLE_RAY_CLUSTER = before
+
+
+@contextmanager
 def connected() -> Iterator[None]:
     """Connect to the cluster of RAY_ADDRESS, or to a new one on this machine that lasts for the `with` block.
 
@@ -329,16 +340,17 @@ def connected() -> Iterator[None]:
         UserError: there is no cluster at RAY_ADDRESS.
         Failure: Ray cannot start here.
     """
-    ray_constants.ENABLE_RAY_CLUSTER = bool(ray_address())  # otherwise Ray listens on loopback
     if ray_address():
         require_reachable(ray_address())
         settings: dict[str, Any] = {}
     else:
         settings = {"include_dashboard": False, "object_store_memory": OBJECT_STORE, "num_cpus": len(own_cores())}
         settings["address"] = "local"  # ignore a local cluster that RAY_ADDRESS does not name
-    with redirect_stdout(io.StringIO()):  # Ray prints a long text on each worker's death
+    # redirect_stdout, because Ray prints a long text on each worker's death
+    with _listening_on_loopback(not ray_address()), redirect_stdout(io.StringIO()):
         try:
-            ray.init(log_to_driver=False, logging_level=logging.FATAL, **settings)
+            with noticing_slow_starts(PATIENCE):
+                ray.init(log_to_driver=False, logging_level=logging.FATAL, **settings)
         except Exception as error:
             if known := cannot_start(error):
                 raise known from error

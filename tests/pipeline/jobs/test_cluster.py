@@ -14,11 +14,12 @@ from typing import Any
 from urllib.request import urlopen
 
 import pytest
+from ray._private import ray_constants
 from rich.console import Console
 
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs import cluster
-from levelproof.pipeline.jobs.address import require_reachable
+from levelproof.pipeline.jobs.address import noticing_slow_starts, require_reachable
 from levelproof.pipeline.jobs.likeness import mismatch, program_of, with_absolute_paths
 from levelproof.pipeline.jobs.progress import Board, Tally
 from levelproof.pipeline.jobs.schedule import MAX_UNITS, Scheduler, WorkUnit
@@ -95,17 +96,30 @@ def test_workers_do_without_a_gpu_that_does_not_answer(monkeypatch: pytest.Monke
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setenv("RAY_OVERRIDE_RESOURCES", '{"GPU": 1}')
     monkeypatch.setenv("RAY_raylet_start_wait_time_s", str(int(patience(COMMAND_SECONDS))))
+    before = ray_constants.ENABLE_RAY_CLUSTER
     cases = (  # lambdas, because Ray sends them by value
         (lambda: time.sleep(600), 1.0, "timed out"),
         (lambda: os.abort(), patience(COMMAND_SECONDS), "died"),
     )
     with cluster.connected():
+        assert not ray_constants.ENABLE_RAY_CLUSTER, "it listens on loopback"
         for probe, seconds, reason in cases:
             monkeypatch.setattr(cluster, "jax_sees_a_gpu", probe)
             monkeypatch.setattr(cluster, "PROBE_PATIENCE", seconds)
             why = cluster._why_no_gpu()
             assert why.startswith("the cluster has one, but no answer came from it (")
             assert reason in why
+    assert before == ray_constants.ENABLE_RAY_CLUSTER, "later clusters of this process listen where they did"
+
+
+def test_slow_starts_are_noticed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", "192.0.2.7:6379")
+    with noticing_slow_starts(60):
+        pass
+    with noticing_slow_starts(0.01):
+        time.sleep(0.5)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("Still waiting for the cluster at RAY_ADDRESS=192.0.2.7:6379 to answer")
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:99999", "a..b:6379"])

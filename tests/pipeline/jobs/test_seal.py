@@ -10,6 +10,7 @@ from levelproof.experts.labels import Label
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.seal import Sealer, sealing
 from levelproof.pipeline.store import seal as store
+from levelproof.pipeline.store.layout import attempt_of, begun_path
 from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.made import commit_copy, made_split
 
@@ -93,5 +94,9 @@ def test_sealing_leaves_no_half_sealed_fragment_after_a_failed_job(split: Path, 
 
     with pytest.raises(KeyboardInterrupt):
         interrupted()
-    assert not list((split / "manifest").glob(".*"))
-    assert {f"shards/{path.name}" for path in (split / "shards").iterdir()} == read_manifest(split).shards
+    named = read_manifest(split).shards
+    replaced = [path for path in (split / "shards").iterdir() if f"shards/{path.name}" not in named]
+    assert {*(split / "manifest").glob(".*")} == {begun_path(path) for path in replaced}, "the next job removes these"
+    for path in replaced:
+        first, last = attempt_of(path).split("-")[:2]
+        assert first == last, "a unit's shard, which stopping left beside the sealed one, and none that was half made"
