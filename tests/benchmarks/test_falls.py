@@ -32,6 +32,7 @@ def falling(thrust: float = 0.45) -> Level:
     return level
 
 
+@pytest.mark.campaign
 def test_fall_bounds_what_random_play_does() -> None:
     """Episodes end within the bound on env steps and the reach, and never in the goal."""
     level = falling()

@@ -150,6 +150,7 @@ class TestInput:
         with pytest.raises(Failure, match=r"kinetix"):
             oracle.versions(oracle.oracle_python())
 
+    @pytest.mark.campaign
     def test_oracle_python_reports_a_missing_network(self, monkeypatch, tmp_path, capsys) -> None:
         """Make a real environment whose pip cannot reach an index."""
         monkeypatch.delenv(oracle.PYTHON_VARIABLE, raising=False)

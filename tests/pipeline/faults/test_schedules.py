@@ -13,7 +13,7 @@ from tests.pipeline.command import ROOT
 from tests.pipeline.faults.effects import lose_power
 
 EACH = 65
-FIRST, SOME = 10_000, 8  # these run by default
+FIRST, SOME = 10_000, 4  # these run by default
 
 
 def run(first: int, count: int) -> None:

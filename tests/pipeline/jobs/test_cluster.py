@@ -189,6 +189,7 @@ with only_writer(split, print):
 """
 
 
+@pytest.mark.campaign
 @pytest.mark.slow
 def test_late_worker_commits_only_for_its_own_driver(tmp_path: Path) -> None:
     split = tmp_path / SPLIT

@@ -94,6 +94,7 @@ def test_bytes_of_worker_grow_with_the_size() -> None:
     assert needs[0] < needs[-1]
 
 
+@pytest.mark.campaign
 def test_crew_does_not_wait_for_a_gpu_that_others_hold() -> None:
     command = [sys.executable, "-c", HELD]
     environment = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}

@@ -111,7 +111,8 @@ def test_command_killed_by_sigkill_continues_to_the_same_bits(undisturbed: Path,
     assert_same_content(tmp_path / SPLIT, undisturbed)
 
 
-@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.campaign), signal.SIGTERM])
+@pytest.mark.campaign
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_run_with_a_killed_worker_stops_and_continues_to_the_same_bits(
     undisturbed: Path, tmp_path: Path, number: signal.Signals
 ) -> None:
