@@ -39,6 +39,7 @@ BENCHMARKS = {  # name: (module, what it measures)
     "manifest": ("benchmarks.manifest", "how long commands take to start on a split of millions of levels"),
     "gallery": ("benchmarks.gallery", "how soon a gallery of many levels appears, and how smoothly it scrolls"),
     "reader": ("benchmarks.reader", "trajectories/s of both readers on the same trajectories"),
+    "seeds": ("benchmarks.seeds", "bytes of seeds, and transitions/s read from them and from a disk"),
     "workers": ("benchmarks.workers", "how much faster two workers are than one, and what a thousand cost the driver"),
     "cloning": ("benchmarks.cloning", "how cloned policies solve unseen levels, against the number of levels"),
     "cold": ("benchmarks.cold", "how long the first levels take with nothing compiled, and the next ones"),

@@ -16,11 +16,26 @@ import numpy as np
 
 from benchmarks.report import Report, Table
 from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.learn.evaluate import ALL, SOLVED
 from levelproof.pipeline.runtime import own_cores
 from levelproof.pipeline.store.manifest import require_manifest
 
 LEVELS, SEEDS, UPDATES, ATTEMPTS = (100, 1000, 5000), 2, 1000, 8
-POLICY, BASELINES = ("policy, sampled", "policy, greedy"), ("doing nothing", "random", "sticky random")
+SAMPLED, GREEDY = "policy, sampled", "policy, greedy"
+BASELINES = (
+    "doing nothing",
+    "random",
+    "sticky random",
+    "its own expert, 16k",
+    "its own expert, 64k",
+    "its own expert, 256k",
+)
+COLUMNS = {  # of sealed levels: which of them count, who plays, and which of its rates
+    "sampled, of all": (ALL, SAMPLED, "once"),
+    "sampled, of solved": (SOLVED, SAMPLED, "once"),
+    "greedy, of solved": (SOLVED, GREEDY, "once"),
+    "best of 8, of solved": (SOLVED, SAMPLED, "best"),
+}
 
 
 def register(parser: argparse.ArgumentParser) -> None:
@@ -28,6 +43,7 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--levels", type=int, nargs="+", default=LEVELS, help="solved levels to clone from")
     parser.add_argument("--seeds", type=int, default=SEEDS, help=f"policies per number of levels (default: {SEEDS})")
     parser.add_argument("--updates", type=int, default=UPDATES, help=f"updates of each policy (default: {UPDATES})")
+    parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of every clone")
     parser.add_argument("--measured", type=int, default=2048, help="sealed levels to measure on (default: 2048)")
     parser.add_argument("--folder", type=Path, default=Path("cloning"), help="where policies are kept")
 
@@ -41,19 +57,26 @@ def run(args: argparse.Namespace) -> Report:
     with ThreadPoolExecutor(len(own_cores())) as threads:
         results = [*threads.map(lambda one: measured(args, int(solved[one[0] - 1]), *one), runs)]
     rows = [row_of(count, [each for each in results if each["levels"] == count]) for count in args.levels]
-    head = ("cloned from", "sampled", "greedy", "best of 8, sampled", "sampled, on levels cloned from")
-    title = (
-        f"Share of {args.measured} sealed levels solved in one attempt: mean over {args.seeds} seeds (least to most)"
-    )
-    baselines = results[0]["sealed"]["all"]
-    others = [[name, *(interval_text(baselines[name][key]) for key in ("once", "best"))] for name in BASELINES]
-    idle = baselines["doing nothing"]["once"]["rate"]
+    head = ("cloned from", *COLUMNS, "sampled, on levels cloned from")
+    counts = {name: f"{rates['random']['levels']:,}" for name, rates in results[0]["sealed"].items()}
+    title = f"Share of sealed levels solved: mean over {args.seeds} seeds (least to most)"
+    players = results[0]["sealed"]
+    others = [
+        [name, *(interval_text(players[levels][name][key]) for levels, key in ((ALL, "once"), (SOLVED, "once"),
+                                                                              (SOLVED, "best")))]
+        for name in BASELINES
+    ]  # fmt: skip
     notes = [
-        f"Each policy took {args.updates:,} updates of 1,024 transitions.",
-        "A tenth of the levels that it was cloned from were kept from training, for validation.",
-        f"Doing nothing solves {idle:.1%} of the levels; not all of the others can be solved.",
+        f"*Of all*: {counts[ALL]} levels, of which some cannot be solved; *of solved*: the {counts[SOLVED]} that are "
+        "labelled solved. One attempt at each level, or the best of 8.",
+        f"Each policy took {args.updates:,} updates of 1,024 transitions{', with ' if args.set else ''}"
+        f"{' '.join(f'`{setting}`' for setting in args.set)}. A tenth of the levels that it was cloned from were kept "
+        "from training, for validation.",
     ]
-    second = Table(("baseline", "one attempt", "best of 8"), others, "The same levels, with 95% intervals over levels")
+    second = Table(
+        ("baseline", "of all", "of solved", "of solved, best of 8"), others,
+        "The same levels, with 95% intervals over levels",
+    )  # fmt: skip
     return Report("Cloning against the number of levels", results, [Table(head, rows, title), second], notes)
 
 
@@ -61,7 +84,8 @@ def measured(args: argparse.Namespace, last: int, count: int, seed: int) -> dict
     """Clone one policy from the first `count` solved levels, the last of which has id `last`; measure it."""
     policy = args.folder / f"{count}-{seed}"
     chosen = f"label = 'solved' AND level_id <= {last}"
-    command("clone", args.split, "-o", policy, f"where={chosen}", f"train.updates={args.updates}", f"seed={seed}")
+    settings = f"where={chosen}", f"train.updates={args.updates}", f"seed={seed}", *args.set
+    command("clone", args.split, "-o", policy, *settings)
     words = "--attempts", str(ATTEMPTS)
     sealed = kept(policy / "sealed.json", policy, *words, "--levels", str(args.measured))
     seen = kept(policy / "seen.json", policy, *words, "--on", args.split, "--where", chosen, "--levels", "1024")
@@ -86,9 +110,9 @@ def command(*words: Any) -> str:
 
 
 def row_of(count: int, results: list[dict[str, Any]]) -> list[str]:
-    once = lambda where, name, key="once": range_text([each[where]["all"][name][key]["rate"] for each in results])
-    return [f"{count:,}", *(once("sealed", name) for name in POLICY), once("sealed", POLICY[0], "best"),
-            once("seen", POLICY[0])]  # fmt: skip
+    ways = [("sealed", *way) for way in COLUMNS.values()] + [("seen", ALL, SAMPLED, "once")]
+    rates = [[each[where][levels][player][key]["rate"] for each in results] for where, levels, player, key in ways]
+    return [f"{count:,}", *map(range_text, rates)]
 
 
 def range_text(rates: list[float]) -> str:

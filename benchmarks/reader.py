@@ -8,16 +8,14 @@ page cache.
 import argparse
 import json
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 from benchmarks import oracle
 from benchmarks.reference.batches import WARM
 from benchmarks.report import Report, Table
+from benchmarks.seeds import command
 from levelproof.levelgen.level import SIZES
-from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.runtime import cache_folder
 from levelproof.pipeline.store.shard import stored_bytes
 
@@ -90,7 +88,7 @@ def folders_of(size: str) -> dict[str, Path]:
     with oracle.alone(cache_folder() / "bench.lock"):
         if not source.is_dir():
             oracle.log(f"Labelling {LEVELS[size]} levels of size {size} to read (once, one to five minutes) ...")
-            _levelproof(
+            command(
                 "generate", f"size={size}", f"levels={LEVELS[size]}", f"budget={BUDGET}", f"out={source.parents[1]}"
             )
         folders = {name: home / name / size for name in (*DENSITIES, "kinetix")}
@@ -99,10 +97,10 @@ def folders_of(size: str) -> dict[str, Path]:
                 unfinished = folders[density].with_name(f"unfinished-{size}")
                 shutil.rmtree(unfinished, ignore_errors=True)
                 shutil.copytree(source, unfinished)
-                _levelproof("seal", unfinished, "--density", density)
+                command("seal", unfinished, "--density", density)
                 unfinished.replace(folders[density])
         if not folders["kinetix"].is_dir():
-            _levelproof(
+            command(
                 "export",
                 folders["full"],
                 "--format",
@@ -113,14 +111,3 @@ def folders_of(size: str) -> dict[str, Path]:
                 folders["kinetix"],
             )
     return folders
-
-
-def _levelproof(*arguments: object) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "levelproof", *map(str, arguments)],
-        env=oracle.our_environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False,
-    )  # fmt: skip
-    if done.returncode:
-        raise Failure(
-            (done.stderr.strip().splitlines() or ["It failed without a message."])[-1].removeprefix("Error: ")
-        )

@@ -188,7 +188,7 @@ def test_known_sealed_levels_are_what_a_job_makes_of_them(size: str, tmp_path: P
 def test_each_look_at_the_sealed_levels_is_logged(tmp_path: Path) -> None:
     policy = policy_in(tmp_path, PolicyKind.ATTENTION, None)
     for look in (1, 2):
-        done = here(["evaluate", str(policy), "--size", "s", "--levels", "4", "--attempts", "2"], tmp_path)
+        done = here(["evaluate", str(policy), "--levels", "4", "--attempts", "2"], tmp_path)
         assert done.returncode == 0, done.stderr
         assert f"Look {look} at the sealed levels" in done.stderr
     looks = [json.loads(line) for line in (policy / LOOKS).read_text().splitlines()]

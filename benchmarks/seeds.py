@@ -1,0 +1,178 @@
+"""Seeds against splits on a disk: bytes per level, and transitions/s of first episodes read in random batches.
+
+The same trajectories are read four ways: simulated from seeds, decoded from `full` shards that the seeds grew into,
+by the reference's own reader from an export of these, and, as the ceiling, stepped without any reading by
+`levelproof.Lanes`. Transitions of first episodes count, and none that repeats another.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pyarrow.parquet as pq
+
+import levelproof
+from benchmarks import oracle
+from benchmarks.fresh import LANES, STEPS, in_lanes
+from benchmarks.report import Report, Table
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.runtime import own_cores, prepare_jax
+from levelproof.pipeline.store.seed.file import seed_files
+
+BATCH = 64
+TRAJECTORIES = 2048  # of the seeds that are read, the first ones
+SEEDS = Path(__file__).parent.parent / "manifests" / "256k" / "s"
+OBSERVATION = "symbolic_flat"
+PUBLISHED_LEVELS, PUBLISHED_BYTES = 11_500_000, 326e9  # solved levels of Kinetix-Offline, and its size
+
+
+def register(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("seeds", type=Path, nargs="?", default=SEEDS, help="seed files (default: manifests/256k/s)")
+    parser.add_argument("--seconds", type=float, default=20.0, help="CPU seconds of each measurement (default: 20)")
+    parser.add_argument("--without-reference", action="store_true", help="leave out the reference's reader")
+
+
+def run(args: argparse.Namespace) -> Report:
+    prepare_jax(own_cores()[0])
+    sizes = stored(args.seeds)
+    with tempfile.TemporaryDirectory() as folder:
+        rates, versions = read(args.seeds, Path(folder), args.seconds, args.without_reference)
+    solved, other = sizes["solved"], sizes["levels"] - sizes["solved"]
+    per_level = sizes["bytes"] / solved
+    columns = sorted(sizes["columns"].items(), key=lambda item: -item[1])
+    return Report(
+        title="Seeds",
+        results=[{"what": "bytes", **sizes}, {"what": "rates", "unit": "transitions/s of a core", **rates}],
+        tables=[
+            Table(
+                ("column", "bytes", "per solved level"),
+                [[name, f"{size:,}", f"{size / solved:.2f}"] for name, size in columns],
+                f"{sizes['levels']:,} levels of {sizes['size']} at {sizes['budget']}, {solved:,} of them solved",
+            ),
+            Table(
+                ("read from", "transitions/s", "trajectories/s", "against Lanes"),
+                [
+                    [name, f"{rate['transitions']:,.0f}", f"{rate['trajectories']:,.0f}" if "trajectories" in rate else
+                     "-", f"{rate['transitions'] / rates['Lanes']['transitions']:.2f}"]
+                    for name, rate in rates.items()
+                ],
+                f"First episodes in random batches of {BATCH}, with {OBSERVATION} observations; per second of CPU time",
+            ),
+        ],
+        notes=[
+            f"The files have {sizes['bytes']:,} bytes: {per_level:.1f} per solved level, with the {other:,} others, "
+            "their labels and all metadata included.",
+            f"At that rate {PUBLISHED_LEVELS:,} solved levels of this size would take "
+            f"{PUBLISHED_LEVELS * per_level / 1e6:,.0f} MB, where the {PUBLISHED_LEVELS:,} of the released dataset, of "
+            f"three sizes, take {PUBLISHED_BYTES / 1e9:,.0f} GB. Seeds keep first episodes; what follows in a released "
+            "record of 256 steps are further episodes of the same expert, which seeds do not have.",
+            f"{TRAJECTORIES:,} trajectories from the page cache, with programs compiled before. *Seeds* are simulated; "
+            "*full* reads whole records of 256 steps, of which the first episode counts here; the *reference* returns "
+            "such records with every array copied, without an observation. *Lanes* plays random actions with "
+            "observations, and reads nothing.",
+        ],
+        reference=versions,
+    )  # fmt: skip
+
+
+def stored(seeds: Path) -> dict[str, Any]:
+    """Return bytes of all files and of each column, and the number of levels and of solved ones."""
+    columns: dict[str, int] = {}
+    total = levels = solved = 0
+    for path in seed_files(seeds):
+        file = pq.ParquetFile(path)
+        total, levels = total + path.stat().st_size, levels + file.metadata.num_rows
+        solved += file.read(["label"])["label"].to_pylist().count("solved")
+        for group in range(file.metadata.num_row_groups):
+            for number in range(file.metadata.num_columns):
+                column = file.metadata.row_group(group).column(number)
+                columns[column.path_in_schema] = columns.get(column.path_in_schema, 0) + column.total_compressed_size
+    if not total:
+        raise Failure(f"There are no seed files at {seeds}.")
+    about = levelproof.read_manifest(seeds, ["size", "budget"]).table
+    columns["(metadata)"] = total - sum(columns.values())
+    facts = {"size": about["size"][0].as_py(), "budget": about["budget"][0].as_py()}
+    return facts | {"bytes": total, "levels": levels, "solved": solved, "columns": columns}
+
+
+def read(seeds: Path, folder: Path, seconds: float, alone: bool) -> tuple[dict[str, Any], dict[str, str]]:
+    """Measure every way to get at the trajectories; return transitions and trajectories per second of CPU time."""
+    part, full, kinetix = folder / "part.parquet", folder / "full", folder / "kinetix"
+    data = levelproof.open(seeds)
+    first, last = (data.manifest["level_id"][i].as_py() for i in (0, min(TRAJECTORIES, len(data)) - 1))
+    within = f"level_id BETWEEN {first} AND {last}"
+    budget, size = (levelproof.read_manifest(seeds, [name]).table[name][0].as_py() for name in ("budget", "size"))
+    split = full / budget / size
+    command("export", seeds, "--format", "seed", "--where", within, "-o", part)
+    command("grow", part, "-o", split, "density=full")
+    ways = {"seeds": part, "full": split}
+    rates = {name: of_reader(path, seconds) for name, path in ways.items()}
+    versions: dict[str, str] = {}
+    if not alone:
+        python = oracle.oracle_python()
+        command("export", split, "--format", "kinetix", "--where", "shard IS NOT NULL", "-o", kinetix)
+        arguments = [kinetix, "--batch", BATCH, "--seconds", seconds]
+        theirs = json.loads(oracle.run_script(python, "batches", arguments, "read trajectories with the reference"))
+        steps = np.mean(levelproof.open(split).manifest["steps_to_goal"].to_numpy())
+        copied = theirs["core_copied"]
+        rates["reference"] = {"transitions": float(copied * steps), "trajectories": copied}
+        versions = oracle.versions(python)
+    return rates | {"Lanes": {"transitions": of_lanes(size, seconds)}}, versions
+
+
+def of_reader(path: Path, seconds: float) -> dict[str, float]:
+    """Read random batches; return transitions of first episodes and trajectories per second of CPU time."""
+    data = levelproof.open(path)
+    steps, draw = data.manifest["steps_to_goal"].to_numpy(), np.random.default_rng(0)
+
+    def batch() -> int:
+        chosen = draw.choice(len(data), BATCH)
+        data.read(chosen, observation=OBSERVATION)
+        return int(steps[chosen].sum())
+
+    transitions, batches, spent = repeated(batch, seconds)
+    return {"transitions": transitions / spent, "trajectories": batches * BATCH / spent}
+
+
+def of_lanes(size: str, seconds: float) -> float:
+    """Step lanes of a table with random actions and observations; return env steps per second of CPU time."""
+    env, params = levelproof.make(levelproof.sample_levels(np.arange(TRAJECTORIES), size))
+    episodes, play = in_lanes(env, params, LANES, TRAJECTORIES)
+    keys = iter(jax.random.split(jax.random.key(0), 1_000_000))
+
+    def turn() -> int:
+        nonlocal episodes
+        episodes, _ = jax.block_until_ready(play(episodes, next(keys)))
+        return LANES * STEPS
+
+    steps, _, spent = repeated(turn, seconds)
+    return steps / spent
+
+
+def repeated(work: Callable[[], int], seconds: float) -> tuple[int, int, float]:
+    """Repeat `work` for some CPU seconds, after two calls that compile; return its sum, the calls and the seconds."""
+    for _ in range(2):
+        work()
+    start, total, calls = time.process_time(), 0, 0
+    while (spent := time.process_time() - start) < seconds:
+        total, calls = total + work(), calls + 1
+    return total, calls, spent
+
+
+def command(*arguments: object) -> None:
+    """Run `levelproof`, silently. Raise Failure with its error if it fails."""
+    oracle.log(f"levelproof {' '.join(map(str, arguments))}")
+    done = subprocess.run(
+        [sys.executable, "-m", "levelproof", *map(str, arguments)],
+        env=oracle.our_environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False,
+    )  # fmt: skip
+    if done.returncode:
+        raise Failure((done.stderr.strip().splitlines() or ["It failed without a message."])[-1])
