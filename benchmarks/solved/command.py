@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from benchmarks.report import Report
-from benchmarks.solved import measure, original, plot, tables
+from benchmarks.solved import larger, measure, original, plot, tables
 from benchmarks.solved.results import FILE, Header, Results, made, read
 from benchmarks.solved.variants import VARIANTS
 from benchmarks.statistics import wilson
@@ -92,10 +92,18 @@ def report_of(results: list[Results], whole: bool) -> Report:
     return Report(
         title="How many levels are solved",
         results=[{"groups": [document(each) for each in results]}],
-        tables=[*tables.tables(results), *([plot.table(curves)] if curves else [])],
+        tables=[
+            *([larger.larger_samples()] if whole else []),
+            *tables.tables(results),
+            *([plot.table(curves)] if curves else []),
+        ],
         notes=[
             *([f"![How the unsolved share falls with budget]({PLOT})"] if curves else []),
             tables.variants_of(results),
+            "*Undecided* levels are neither trivial nor proved unsolvable. Tables after the first compare variants on "
+            f"the same levels: those of `default` with fewer than {tables.ENOUGH:,} undecided ones, marked *few*, are "
+            "not to be quoted for the solved share itself. Their levels are of sampler 1, whose numbers differ from "
+            "today's in the last bits.",
             "*An expert reaches the goal by itself* if its witness is its own, or if attempts of its last evaluation "
             "reach it; a search's witness replaces an expert's that survives fewer than half of its replays. Success "
             "rates are of first episodes; - means not measured.",

@@ -10,6 +10,7 @@ from benchmarks.solved.variants import VARIANTS
 from benchmarks.statistics import mcnemar
 from levelproof.experts.labels import BY_EXPERT
 
+ENOUGH = 1000  # undecided levels for a solved share that may be quoted
 QUARTER = "alone"  # the variant compared with the reference also at a quarter of the budget
 HEAD = (
     "variant", "undecided levels", "solved (95% interval)", "by an expert's own witness",
@@ -58,9 +59,10 @@ def line(results: Results) -> list[str]:
     quarter = len(results.solved(header.budget / 4))
     own = [row["witness"] and row["witness"] in BY_EXPERT for row in rows]
     rate = mean([row["success_rate"] for row in rows])
+    few = " (few)" if header.variant == "default" and len(trained) < ENOUGH else ""
     return [
         f"`{header.variant}`",
-        f"{len(trained)} of {len(results.rows)}",
+        f"{len(trained)} of {len(results.rows)}{few}",
         share(len(solved), len(trained)),
         known_share(own),
         known_share([reaches(row) for row in rows]),

@@ -13,8 +13,8 @@ import pytest
 
 from benchmarks import oracle
 from benchmarks.__main__ import main
+from benchmarks.solved import larger, original, plot, tables
 from benchmarks.solved import measure as measuring
-from benchmarks.solved import original, plot, tables
 from benchmarks.solved.measure import measure, rows_in, work
 from benchmarks.solved.results import Header, Results, count, made, merge, read, share
 from benchmarks.solved.variants import VARIANTS, Variant
@@ -400,3 +400,13 @@ def test_original_trains_a_level(tmp_path: Path, reference: Path, monkeypatch: p
         assert (result["label"] == "solved") == (result["steps_to_goal"] is not None)
         assert (result["steps_to_goal"] or 1) <= RECORD_STEPS
         assert result["core_seconds"] > 0
+
+
+def test_larger_samples_have_enough_levels_to_quote() -> None:
+    rows = {(row[0], row[1]): row for row in larger.larger_samples().rows}
+    assert {size for size, _ in rows} == {"s", "m", "l"}
+    for _, levels, undecided, solved, *_ in rows.values():
+        total, few = (int(cell.split()[0].replace(",", "")) for cell in (levels, undecided))
+        assert tables.ENOUGH <= few < total
+        low, high = (float(x) for x in solved.partition("(")[2].rstrip(")").split(" to "))
+        assert high - low < 5
