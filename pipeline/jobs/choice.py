@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from levelproof.configs.numbers import parse_count
-from levelproof.configs.schema import JobConfig
+from levelproof.configs.schema import GrowConfig, JobConfig
 from levelproof.pipeline.jobs.address import ray_address
 
 SMALL = 2  # untimed work units; a process makes them in the time in which Ray and its workers start
@@ -23,4 +23,6 @@ def runs_here(job: JobConfig, levels: int) -> bool:
     if ray_address() or job.device == "gpu" or job.workers > 1:
         return False
     unit = replace(job, unit=None).levels_per_unit
-    return levels * max(job.env_steps, DEFAULT_BUDGET) <= SMALL * unit * DEFAULT_BUDGET
+    # To grow a level costs the same whatever its expert's budget was
+    budget = DEFAULT_BUDGET if isinstance(job, GrowConfig) else max(job.env_steps, DEFAULT_BUDGET)
+    return levels * budget <= SMALL * unit * DEFAULT_BUDGET

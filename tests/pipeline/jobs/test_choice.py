@@ -2,6 +2,7 @@
 
 import pytest
 
+from levelproof.configs.schema import GrowConfig
 from levelproof.pipeline.jobs.choice import runs_here
 from tests.pipeline.made import made_job
 
@@ -16,6 +17,12 @@ def test_job_runs_here_up_to_a_number_of_levels(words: tuple[str, ...], levels: 
     job = made_job("data", "executor=auto", *words)
     assert runs_here(job, levels)
     assert not runs_here(job, levels + 1)
+
+
+def test_growing_is_judged_by_its_levels_alone() -> None:
+    jobs = [GrowConfig(size="s", budget=budget, executor="auto") for budget in ("5k", "16M")]
+    assert all(runs_here(job, 512) for job in jobs)
+    assert not any(runs_here(job, 513) for job in jobs)
 
 
 @pytest.mark.parametrize("word", ["workers=2", "device=gpu", ON_RAY])
