@@ -112,7 +112,7 @@ def read(seeds: Path, folder: Path, seconds: float, alone: bool) -> tuple[dict[s
     budget, size = (levelproof.read_manifest(seeds, [name]).table[name][0].as_py() for name in ("budget", "size"))
     split = full / budget / size
     command("export", seeds, "--format", "seed", "--where", within, "-o", part)
-    command("grow", part, "-o", split, "density=full")
+    command("grow", part, "-o", split, "density=full", "executor=inline")
     ways = {"seeds": part, "full": split}
     rates = {name: of_reader(path, seconds) for name, path in ways.items()}
     versions: dict[str, str] = {}
