@@ -64,11 +64,13 @@ def play_sticky(params: Any, moment: Moment) -> Int[Array, "6 lane"]:
     return jnp.where(left >= 0, _evenly(left), moment.previous)
 
 
+@lru_cache(maxsize=16)
 def play_sampled(network: NetworkConfig) -> Player:
     """Return the player that samples from a policy's logits; its parameters are the policy's."""
     return lambda params, moment: sample(_logits(params, network, moment), moment.uniform)
 
 
+@lru_cache(maxsize=16)
 def play_most_probable(network: NetworkConfig) -> Player:
     """Return the player that takes a policy's most probable choices; its parameters are the policy's."""
     return lambda params, moment: most_probable(_logits(params, network, moment))
@@ -146,6 +148,7 @@ class _Playing(NamedTuple):
     env_steps: Int[Array, " lane"]
 
 
+@lru_cache(maxsize=16)
 def _program(player: Player, attempts: int, rules: TaskParams) -> Callable[..., FirstEpisodes]:
     """Compile the episodes of a batch of levels; `first` is the number of their first attempt."""
 

@@ -9,11 +9,15 @@ from typing import Any
 import pytest
 from xdist.scheduler import LoadScopeScheduling
 
+from tests.quick import is_brief
+
 NOT_REACHED = "not reached: "
 # Groups of files that run in one process, one test after another, because they trace and load the same programs. The
 # group "jobs" starts first: it compiles what all commands and workers load afterwards. Tests of physics run beside it
-# in another process, because they need none of those programs.
+# in another process, because they need none of those programs. Groups that compile without XLA's optimiser come last: a
+# process that goes back to optimising has to forget its programs.
 TOGETHER = {
+    "brief experts": ("tests/experts/generalist", "tests/experts/networks"),
     "jobs": ("tests/pipeline/jobs", "tests/pipeline/cli", "tests/test_manifests", "tests/benchmarks/test_handmade"),
     "experts": ("tests/experts",),
     "look": ("tests/pipeline/look/test_show", "tests/pipeline/look/test_gallery"),
@@ -44,10 +48,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 def by_slow_tests(items: list[pytest.Item]) -> dict[str, Any]:
     """Return a sort key per group: groups with many slow tests come early, so that none is left for a single process
-    at the end."""
+    at the end; groups that compile without XLA's optimiser come after the others."""
     slow = Counter(group_of(item.nodeid) for item in items if item.get_closest_marker("slow"))
     groups = {group_of(item.nodeid) for item in items}
-    return {group: (group != FIRST, not group.startswith(BESIDE), -slow[group]) for group in groups}
+    brief = {group_of(item.nodeid) for item in items if is_brief(item.nodeid)}
+    return {group: (group != FIRST, not group.startswith(BESIDE), group in brief, -slow[group]) for group in groups}
 
 
 def shuffled(items: list[pytest.Item], seed: str) -> dict[str, int]:

@@ -12,10 +12,11 @@ FAST_COMPILING = "jax_disable_most_optimizations"  # a setting of JAX
 # XLA. No test here compares other bits with those of a process that optimises.
 BRIEF = (
     "tests/experts/generalist/",
+    "tests/experts/networks/",
     "tests/levelgen/task/",
     "tests/pipeline/dataset/",
     "tests/pipeline/exchange/",
-    "tests/pipeline/learn/test_train",
+    "tests/pipeline/learn/",
     "tests/pipeline/look/",
     "tests/pipeline/play/",
     "tests/pipeline/read/",
@@ -25,9 +26,14 @@ BRIEF = (
 jit_once = partial(jax.jit, compiler_options=UNOPTIMISED)
 
 
+def is_brief(nodeid: str) -> bool:
+    """Whether a test's programs compile without XLA's optimiser."""
+    return nodeid.startswith(BRIEF)
+
+
 def compile_for(nodeid: str) -> None:
     """Set whether XLA optimises what a module of tests jits, here and in processes that it starts."""
-    brief = nodeid.startswith(BRIEF)
+    brief = is_brief(nodeid)
     if jax.config.read(FAST_COMPILING) and not brief:
         jax.clear_caches()  # JAX would take the programs that were compiled without the optimiser
     jax.config.update(FAST_COMPILING, brief)

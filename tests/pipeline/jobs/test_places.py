@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 from levelproof.levelgen.level import size_of
 from levelproof.pipeline.jobs.places import (
     GB,

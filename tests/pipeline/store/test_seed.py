@@ -70,7 +70,8 @@ def test_witnesses_unpack_to_the_actions_that_were_packed() -> None:
 
 
 def test_the_ten_lines_of_the_guide_decode_a_witness() -> None:
-    (code,) = re.findall(r"^```python\n(.*?)^```", Path("docs/seeds.md").read_text(), re.DOTALL | re.MULTILINE)
+    codes = re.findall(r"^```python\n(.*?)^```", Path("docs/seeds.md").read_text(), re.DOTALL | re.MULTILINE)
+    (code,) = [each for each in codes if "def actions" in each]
     names: dict[str, Any] = {}
     exec(code, names)
     rng = np.random.default_rng(1)
