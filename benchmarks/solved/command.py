@@ -102,8 +102,8 @@ def report_of(results: list[Results], whole: bool) -> Report:
             tables.variants_of(results),
             "*Undecided* levels are neither trivial nor proved unsolvable. Tables after the first compare variants on "
             f"the same levels: those of `default` with fewer than {tables.ENOUGH:,} undecided ones, marked *few*, are "
-            "not to be quoted for the solved share itself. All rows but those of `default` at 256k on m and l are of "
-            "sampler 1, whose numbers differ from today's in the last bits.",
+            "not to be quoted for the solved share itself. Their levels are of sampler 1, whose numbers differ from "
+            "today's in the last bits.",
             "*An expert reaches the goal by itself* if its witness is its own, or if attempts of its last evaluation "
             "reach it; a search's witness replaces an expert's that survives fewer than half of its replays. Success "
             "rates are of first episodes; - means not measured.",
