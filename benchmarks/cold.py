@@ -59,6 +59,7 @@ def run(args: argparse.Namespace) -> Report:
 def reported(jobs: Mapping[str, Sequence[str]], results: Sequence[Mapping[str, Any]]) -> Report:
     """Report the medians of runs; `jobs` are settings by name."""
     runs = len({result["run"] for result in results})
+    times = "One run" if runs == 1 else f"Medians of {runs} runs"
     medians = {name: _median([result for result in results if result["job"] == name]) for name in jobs}
     calibration = float(np.median([result["calibration"] for result in results]))
     missed = [f"{name} takes {medians[name]['wall']:.0f} s, not {limit:.0f}" for name, limit in TARGETS.items()
@@ -71,7 +72,7 @@ def reported(jobs: Mapping[str, Sequence[str]], results: Sequence[Mapping[str, A
         results=results,
         tables=[Table(head, [_row(name, jobs[name], medians[name]) for name in jobs])],
         notes=[
-            f"Medians of {runs} runs of `levelproof generate`. *cold*: with an empty cache folder. *warm*: the same "
+            f"{times} of `levelproof generate`. *cold*: with an empty cache folder. *warm*: the same "
             "command into another folder, with the programs that *cold* has left. *larger*: another job with the same "
             "programs. *levels*: core-seconds that workers charge to levels; compiling includes tracing and loading.",
             f"To compile a fixed program took {calibration:.2f} s in the same runs (median).",
