@@ -78,6 +78,15 @@ def run_ours(script: str, arguments: Sequence[object]) -> str:
     return _run([sys.executable, "-m", f"benchmarks.ours.{script}", *arguments], f"run our {script}", our_environment())
 
 
+def run_levelproof(*arguments: object) -> str:
+    """Run `levelproof` in its own process; return what it prints.
+
+    Raises:
+        Failure: the command fails.
+    """
+    return _run([sys.executable, "-m", "levelproof", *arguments], f"run levelproof {arguments[0]}", our_environment())
+
+
 def versions(python: Path) -> dict[str, str]:
     """Return the versions of the reference and of its dependencies."""
     names = ("kinetix-env", "jax2d", "jax", "jaxlib")
@@ -116,7 +125,7 @@ def _run(command: Sequence[object], task: str, environment: Mapping[str, str], h
     arguments = [str(argument) for argument in command]
     done = subprocess.run(arguments, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
-        reason = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        reason = (done.stderr.strip().splitlines() or ["no message"])[-1].removeprefix("Error: ")
         raise Failure(f"Cannot {task} ({reason})" + (f": {hint}." if hint else "."))
     return done.stdout
 

@@ -14,7 +14,6 @@ from typing import Any
 from benchmarks import oracle
 from benchmarks.reference.batches import WARM
 from benchmarks.report import Report, Table
-from benchmarks.seeds import command
 from levelproof.levelgen.level import SIZES
 from levelproof.pipeline.runtime import cache_folder
 from levelproof.pipeline.store.shard import stored_bytes
@@ -88,7 +87,7 @@ def folders_of(size: str) -> dict[str, Path]:
     with oracle.alone(cache_folder() / "bench.lock"):
         if not source.is_dir():
             oracle.log(f"Labelling {LEVELS[size]} levels of size {size} to read (once, one to five minutes) ...")
-            command(
+            oracle.run_levelproof(
                 "generate", f"size={size}", f"levels={LEVELS[size]}", f"budget={BUDGET}", f"out={source.parents[1]}"
             )
         folders = {name: home / name / size for name in (*DENSITIES, "kinetix")}
@@ -97,10 +96,10 @@ def folders_of(size: str) -> dict[str, Path]:
                 unfinished = folders[density].with_name(f"unfinished-{size}")
                 shutil.rmtree(unfinished, ignore_errors=True)
                 shutil.copytree(source, unfinished)
-                command("seal", unfinished, "--density", density)
+                oracle.run_levelproof("seal", unfinished, "--density", density)
                 unfinished.replace(folders[density])
         if not folders["kinetix"].is_dir():
-            command(
+            oracle.run_levelproof(
                 "export",
                 folders["full"],
                 "--format",

@@ -7,8 +7,6 @@ by the reference's own reader from an export of these, and, as the ceiling, step
 
 import argparse
 import json
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -44,7 +42,8 @@ def run(args: argparse.Namespace) -> Report:
     prepare_jax(own_cores()[0])
     sizes = stored(args.seeds)
     with tempfile.TemporaryDirectory() as folder:
-        rates, versions = read(args.seeds, Path(folder), args.seconds, args.without_reference)
+        split = Path(folder, "full", sizes["budget"], sizes["size"])
+        rates, versions = read(args.seeds, Path(folder, "part.parquet"), split, args.seconds, args.without_reference)
     solved, other = sizes["solved"], sizes["levels"] - sizes["solved"]
     per_level = sizes["bytes"] / solved
     columns = sorted(sizes["columns"].items(), key=lambda item: -item[1])
@@ -103,29 +102,34 @@ def stored(seeds: Path) -> dict[str, Any]:
     return facts | {"bytes": total, "levels": levels, "solved": solved, "columns": columns}
 
 
-def read(seeds: Path, folder: Path, seconds: float, alone: bool) -> tuple[dict[str, Any], dict[str, str]]:
-    """Measure every way to get at the trajectories; return transitions and trajectories per second of CPU time."""
-    part, full, kinetix = folder / "part.parquet", folder / "full", folder / "kinetix"
+def read(seeds: Path, part: Path, split: Path, seconds: float, alone: bool) -> tuple[dict[str, Any], dict[str, str]]:
+    """Measure every way to get at the trajectories; return transitions and trajectories per second of CPU time.
+
+    Args:
+        seeds: the seed files.
+        part: new seed file, of the trajectories that are read.
+        split: new split, which `part` grows into.
+        seconds: CPU seconds of each measurement.
+        alone: leave out the reference's reader.
+    """
     data = levelproof.open(seeds)
     first, last = (data.manifest["level_id"][i].as_py() for i in (0, min(TRAJECTORIES, len(data)) - 1))
     within = f"level_id BETWEEN {first} AND {last}"
-    budget, size = (levelproof.read_manifest(seeds, [name]).table[name][0].as_py() for name in ("budget", "size"))
-    split = full / budget / size
-    command("export", seeds, "--format", "seed", "--where", within, "-o", part)
-    command("grow", part, "-o", split, "density=full", "executor=inline")
+    oracle.run_levelproof("export", seeds, "--format", "seed", "--where", within, "-o", part)
+    oracle.run_levelproof("grow", part, "-o", split, "density=full", "executor=inline")
     ways = {"seeds": part, "full": split}
     rates = {name: of_reader(path, seconds) for name, path in ways.items()}
     versions: dict[str, str] = {}
     if not alone:
-        python = oracle.oracle_python()
-        command("export", split, "--format", "kinetix", "--where", "shard IS NOT NULL", "-o", kinetix)
+        python, kinetix = oracle.oracle_python(), split.with_name("kinetix")
+        oracle.run_levelproof("export", split, "--format", "kinetix", "--where", "shard IS NOT NULL", "-o", kinetix)
         arguments = [kinetix, "--batch", BATCH, "--seconds", seconds]
         theirs = json.loads(oracle.run_script(python, "batches", arguments, "read trajectories with the reference"))
         steps = np.mean(levelproof.open(split).manifest["steps_to_goal"].to_numpy())
         copied = theirs["core_copied"]
         rates["reference"] = {"transitions": float(copied * steps), "trajectories": copied}
         versions = oracle.versions(python)
-    return rates | {"Lanes": {"transitions": of_lanes(size, seconds)}}, versions
+    return rates | {"Lanes": {"transitions": of_lanes(split.name, seconds)}}, versions
 
 
 def of_reader(path: Path, seconds: float) -> dict[str, float]:
@@ -165,14 +169,3 @@ def repeated(work: Callable[[], int], seconds: float) -> tuple[int, int, float]:
     while (spent := time.process_time() - start) < seconds:
         total, calls = total + work(), calls + 1
     return total, calls, spent
-
-
-def command(*arguments: object) -> None:
-    """Run `levelproof`, silently. Raise Failure with its error if it fails."""
-    oracle.log(f"levelproof {' '.join(map(str, arguments))}")
-    done = subprocess.run(
-        [sys.executable, "-m", "levelproof", *map(str, arguments)],
-        env=oracle.our_environment(), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, check=False,
-    )  # fmt: skip
-    if done.returncode:
-        raise Failure((done.stderr.strip().splitlines() or ["It failed without a message."])[-1])
