@@ -6,6 +6,7 @@ from pathlib import Path
 from levelproof.pipeline.errors import UserError
 
 BUCKETS, WEB, HUB = ("s3:", "gs:", "az:"), ("https:", "http:"), ("hf:",)
+BUILTIN = "builtin:"  # as in experts.networks.saved, which this file must not import: it starts JAX
 SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
 
 
@@ -25,3 +26,9 @@ def require_here(path: Path) -> None:
             f"This command cannot write to {path.parts[0]}//{'/'.join(path.parts[1:])}: "
             "give a file or folder on this machine."
         )
+
+
+def require_policy(path: Path) -> None:
+    """Raise UserError as `require_known`, but take the name of a policy that comes with levelproof for no URL."""
+    if not str(path).startswith(BUILTIN):
+        require_known(path)

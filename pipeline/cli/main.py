@@ -14,15 +14,15 @@ from levelproof.configs.errors import ConfigError, readable
 from levelproof.pipeline.cli.command import EXITS
 from levelproof.pipeline.errors import Exit, LevelproofError, UserError
 from levelproof.pipeline.outlet import outlets
-from levelproof.pipeline.urls import require_here, require_known
+from levelproof.pipeline.urls import require_here, require_known, require_policy
 from levelproof.pipeline.version import __version__
 
 NAMES = (
     "generate regenerate settings sample inspect columns plan diff show gallery play clone train evaluate export grow "
     "import_ card status verify seal"
 )
-OUTPUTS = ("out", "plot")  # arguments whose paths must be on this machine
-BUILTIN = "builtin:"  # before the name of a policy that comes with levelproof; experts.networks.saved imports JAX
+# Checks of arguments that are paths; those of other names must not be URLs of an unsupported kind
+CHECKS = {"out": require_here, "plot": require_here, "policy": require_policy}
 COMMANDS = [import_module(f"levelproof.pipeline.cli.{name}") for name in NAMES.split()]
 
 
@@ -70,8 +70,8 @@ def _check_paths(arguments: argparse.Namespace) -> None:
     """Raise UserError for a path that is a URL of an unsupported kind, or that must be local."""
     for name, value in vars(arguments).items():
         for path in value if isinstance(value, list) else [value]:
-            if isinstance(path, Path) and not (name == "policy" and str(path).startswith(BUILTIN)):
-                (require_here if name in OUTPUTS else require_known)(path)
+            if isinstance(path, Path):
+                CHECKS.get(name, require_known)(path)
 
 
 def _report(sentence: str, code: int) -> int:

@@ -328,7 +328,7 @@ def _listening_on_loopback(alone: bool) -> Iterator[None]:
     ray_constants.ENABLE_RAY_CLUSTER = not alone
     try:
         yield
-    finally:  # of later clusters of this process, a test's for one, the caller decides
+    finally:  # whoever starts another cluster in this process decides for it
         ray_constants.ENABLE_RAY_CLUSTER = before
 
 

@@ -69,7 +69,7 @@ def require_finite(loss: float, setting: str) -> None:
     if not math.isfinite(loss):
         raise Failure(
             f"The loss is {loss}, so the weights have diverged: start again with a smaller {setting} and another -o "
-            "(the checkpoint is that of the last interval)."
+            "(no checkpoint was overwritten)."
         )
 
 
