@@ -40,13 +40,13 @@ def solved_by_entities(manifest: Manifest, ids: np.ndarray) -> dict[str, Any]:
     """
     if len(ids) > MANY:
         problem = f"not computed for more than {MANY:,} levels: choose some with --where"
-        return {"levels": 0, "looked_at": 0, "of": len(ids), "problem": problem}
+        return {"levels": 0, "sampled": 0, "of": len(ids), "problem": problem}
     read = from_files(manifest.config or {})
     most = min(READ if read else SAMPLED, len(ids))
     rows = require_manifest(manifest.split, COLUMNS, ids[:most]).table
     tried = np.isin(rows["label"].to_pylist(), [label.value for label in TRAINED])
     rows = rows.filter(pa.array(tried))
-    facts: dict[str, Any] = {"levels": rows.num_rows, "looked_at": most, "of": len(ids), "problem": None}
+    facts: dict[str, Any] = {"levels": rows.num_rows, "sampled": most, "of": len(ids), "problem": None}
     if not rows.num_rows:
         return facts
     if not read:  # ids suffice: read no shards

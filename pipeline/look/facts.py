@@ -77,7 +77,7 @@ def _by_entities(shares: Mapping[str, Any] | None) -> dict[str, str | None]:
         return {"solved, by entities": shares["problem"]}
     if not shares or not shares["levels"]:
         return {}
-    sample = f" (of {shares['levels']:,} sampled)" if shares["looked_at"] < shares["of"] else ""
+    sample = f" (of {shares['levels']:,} sampled)" if shares["sampled"] < shares["of"] else ""
     ends = lambda share: "-".join(f"{100 * end:.0f}" for end in share["interval"])
     shown = lambda share: f"{share['solved'] / share['tried']:.0%} ({ends(share)}) of {share['tried']:,}"
     return {

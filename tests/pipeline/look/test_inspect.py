@@ -146,7 +146,7 @@ def test_solved_by_entities_resamples_levels_from_ids(split: Path, monkeypatch: 
     monkeypatch.setattr(levels_module, "read_rows", None)
     monkeypatch.setattr(entities, "SAMPLED", 8)
     facts = solved_by_entities(read_manifest(split, ["label"]), np.arange(12))
-    assert (facts["looked_at"], facts["of"], facts["levels"]) == (8, 12, 4)
+    assert (facts["sampled"], facts["of"], facts["levels"]) == (8, 12, 4)
     levels = sample_levels(np.arange(12), SIZES["s"])
     for name, counts in count_entities(levels).items():
         assert set(facts[name]) <= {str(count) for count in counts}
