@@ -59,6 +59,24 @@ def flat(tree: Mapping[str, Any], path: str = "") -> dict[str, Any]:
     return leaves
 
 
+def nested(leaves: Mapping[str, Any]) -> dict[str, Any]:
+    """Invert `flat`.
+
+    Raises:
+        ValueError: a name lies below that of a value.
+    """
+    tree: dict[str, Any] = {}
+    for name, value in leaves.items():
+        *groups, last = name.split(".")
+        group = tree
+        for part in groups:
+            group = group.setdefault(part, {})
+            if not isinstance(group, dict):
+                raise ValueError(f"{name} lies below a value")
+        group[last] = value
+    return tree
+
+
 def _join(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from levelproof.configs.convert import flat, plain
+from levelproof.configs.convert import flat, nested, plain
 from levelproof.configs.errors import ConfigError
 from levelproof.configs.numbers import parse_count, parse_duration
 from levelproof.experts.config import ExpertConfig, StopConfig, check_budget
@@ -54,7 +54,15 @@ WITHOUT_EFFECT = frozenset(
         "search.rounds",
     }
 )
-RENAMED: Mapping[str, str] = {}  # today's dotted names of settings by their names in earlier versions
+# Today's dotted names of settings by their names in earlier versions; overrides may use those for one version
+RENAMED: Mapping[str, str] = {
+    "expert.moved_attempts": "expert.perturbed_attempts",
+    "search.anew": "search.new_action",
+    "search.redrawn": "search.resample",
+    "search.steady": "search.robustness",
+    "search.stretch": "search.segments",
+    "stop.steady": "stop.robustness",
+}
 REMOVED: Mapping[str, Any] = {"scout.rounds": 0}  # settings of earlier versions: the value that matches this version
 # Values of `distribution` in the hashed settings of jobs whose levels are not sampled
 FROM_FILES, FROM_RECORDS = "files", "import"
@@ -225,19 +233,8 @@ def decisive(settings: Mapping[str, Any], renamed: Mapping[str, str] = RENAMED) 
     Raises:
         ValueError: a setting lies below a value.
     """
-    kept: dict[str, Any] = {}
-    for name, value in flat(settings).items():
-        if REMOVED.get(name, ...) == value:
-            continue
-        if (now := renamed.get(name, name)) not in WITHOUT_EFFECT:
-            *groups, last = now.split(".")
-            group = kept
-            for part in groups:
-                group = group.setdefault(part, {})
-                if not isinstance(group, dict):
-                    raise ValueError(f"{now} lies below a value")
-            group[last] = value
-    return kept
+    now = {renamed.get(name, name): value for name, value in flat(settings).items() if REMOVED.get(name, ...) != value}
+    return nested({name: value for name, value in now.items() if name not in WITHOUT_EFFECT})
 
 
 def hash_of(results: dict[str, Any]) -> str:

@@ -63,7 +63,7 @@ class ExpertConfig:
     # evaluation: one record per lane
     attempts: int = 16  # unperturbed lanes: the first takes the most probable actions, the others sample
     sticky_attempts: int = 8  # lanes in which the last action sometimes replaces the expert's
-    moved_attempts: int = 8  # lanes that start with perturbed velocities
+    perturbed_attempts: int = 8  # lanes that start with perturbed velocities
     # witness
     witness: Choice = Choice.RECORD  # successes of an evaluation that can become a level's witness
     exploration: bool = True  # trained levels: if no evaluation succeeds, accept a success from search or training
@@ -79,7 +79,7 @@ class ExpertConfig:
         require(self, at_least_one, 1)
         require(self, ("learning_rate", "adam_epsilon", "max_gradient_norm"), 0, above=True)
         require(self, ("discount", "gae_lambda", "clip", "persistence"), 0, 1)
-        require(self, (*not_negative, "rehearsals", "sticky_attempts", "moved_attempts", "replays"), 0)
+        require(self, (*not_negative, "rehearsals", "sticky_attempts", "perturbed_attempts", "replays"), 0)
         if self.steps_per_update % self.minibatches:
             raise ValueError(
                 f"minibatches is {self.minibatches}: it must divide environments x horizon = {self.steps_per_update}"
@@ -89,10 +89,10 @@ class ExpertConfig:
                 f"rehearsals is {self.rehearsals}: it must be below environments = {self.environments}, so that the "
                 "expert chooses the actions in some of them"
             )
-        lanes = self.attempts + self.sticky_attempts + self.moved_attempts
+        lanes = self.attempts + self.sticky_attempts + self.perturbed_attempts
         if lanes > self.environments:
             raise ValueError(
-                f"attempts, sticky_attempts and moved_attempts add up to {lanes}: "
+                f"attempts, sticky_attempts and perturbed_attempts add up to {lanes}: "
                 f"their sum must not exceed environments = {self.environments}"
             )
 
@@ -120,7 +120,7 @@ class StopConfig:
     share: float = 0.25  # share of an update's finished episodes that must reach the goal to trigger an evaluation
     wait: int = 2048  # env steps of training between a failed evaluation and the next; doubles each time
     polish: int = 0  # env steps of training after a level is solved, to shorten its witness; 0: none
-    steady: int = 65_536  # env steps of training after a level is solved, if its witness is fragile; 0: none
+    robustness: int = 65_536  # env steps of training after a level is solved, if its witness is fragile; 0: none
     first_rung: int = 2048  # env steps of training at the first rung; each rung doubles them
     gain: float = 0.05  # minimum growth of the best return between rungs
     fruitless: int = (
@@ -129,7 +129,7 @@ class StopConfig:
 
     def __post_init__(self) -> None:
         require(self, ("successes", "first_rung"), 1)
-        require(self, ("wait", "polish", "steady", "gain", "fruitless"), 0)
+        require(self, ("wait", "polish", "robustness", "gain", "fruitless"), 0)
         require(self, ("share",), 0, 1)
 
 
@@ -160,7 +160,7 @@ def check_budget(budget: int, config: ExpertConfig, stopping: StopConfig) -> Non
     waits = {
         "wait": config.updates_in(stopping.wait) << MAX_DOUBLINGS,
         "polish": config.updates_in(stopping.polish),
-        "steady": config.updates_in(stopping.steady),
+        "robustness": config.updates_in(stopping.robustness),
         "first_rung": config.updates_in(stopping.first_rung),
     }
     for name, longest in waits.items():

@@ -61,7 +61,7 @@ class Verdict:
     # of the last evaluation; NaN: no such attempts
     most_probable_succeeds: bool = False  # in every episode of the attempt with the most probable actions
     sticky_success_rate: float = nan  # of attempts with sticky actions, first episodes
-    moved_success_rate: float = nan  # of attempts from perturbed velocities, first episodes
+    perturbed_success_rate: float = nan  # of attempts from perturbed velocities, first episodes
     steps_to_goal: int | None = None  # env steps of the witness's first episode
     steps_to_first_success: int | None = None  # env steps of training
     env_steps: int = 0  # of training

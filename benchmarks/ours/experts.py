@@ -32,7 +32,7 @@ def main() -> None:
     from levelproof.levelgen.task.rules import TaskParams
 
     jax.config.update("jax_enable_compilation_cache", False)  # compiling is timed
-    no_evaluation = {"attempts": 1, "sticky_attempts": 0, "moved_attempts": 0}
+    no_evaluation = {"attempts": 1, "sticky_attempts": 0, "perturbed_attempts": 0}
     config = replace(REFERENCE.expert, environments=args.environments, horizon=args.horizon, **no_evaluation)
     rules = TaskParams(dense_reward_scale=config.dense_reward_scale)
     levels = load_levels(args.levels, args.first, args.count)

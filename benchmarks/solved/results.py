@@ -12,6 +12,8 @@ import pyarrow.parquet as pq
 
 from benchmarks.oracle import alone
 from benchmarks.statistics import wilson
+from levelproof.configs.convert import flat, nested
+from levelproof.configs.schema import RENAMED
 from levelproof.experts.config import Rule
 from levelproof.experts.labels import TRAINED, Label
 from levelproof.pipeline.errors import UserError
@@ -103,7 +105,9 @@ def read(file: Path = FILE) -> list[Results]:
     for line in lines:
         key = line["size"], line["budget"], line["variant"]
         if key not in groups:
-            groups[key] = Results(Header(key[2], key[0], key[1], json.loads(line["settings"])), {})
+            settings = flat(json.loads(line["settings"]))
+            now = nested({RENAMED.get(name, name): value for name, value in settings.items()})
+            groups[key] = Results(Header(key[2], key[0], key[1], now), {})
         groups[key].rows[line["level_id"]] = {name: line[name] for name in (*OF_LEVEL, *OF_RUN)}
     return list(groups.values())
 

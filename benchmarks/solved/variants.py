@@ -45,7 +45,7 @@ def without(text: str, **changed: Any) -> Variant:
 VARIANTS: Mapping[str, Variant] = {
     "original": Variant(
         "the reference's PPO in the reference's own environment and physics, the whole budget for every level",
-        replace(REFERENCE, expert=replace(REFERENCE.expert, sticky_attempts=0, moved_attempts=0)),
+        replace(REFERENCE, expert=replace(REFERENCE.expert, sticky_attempts=0, perturbed_attempts=0)),
         ("reference",),
         original=True,
     ),

@@ -258,7 +258,7 @@ class Pool:
 
     def _fragile(self, solved: Mapping[int, Entrant]) -> list[int]:
         """Return slots of solved levels without a portable witness; each level keeps its best candidate."""
-        if not (solved and self.procedure.stop.steady and self.config.replays):
+        if not (solved and self.procedure.stop.robustness and self.config.replays):
             return []
         with lap() as took:
             candidates = [submission.candidates[i] for submission, i, _ in solved.values()]

@@ -9,7 +9,7 @@ import numpy as np
 
 from levelproof.experts.batcher import Rows, blank, entered
 from levelproof.experts.config import RECORD_STEPS, Rule
-from levelproof.experts.pool import rework, steady
+from levelproof.experts.pool import rework, strengthen
 from levelproof.experts.pool.pool import GROUP, Pool, slot_count
 from levelproof.experts.search import explore, vary
 from levelproof.experts.search.search import explored, side_by_side, varied
@@ -102,7 +102,7 @@ def entering(fresh: Callable[[], Rows], width: int, stage: str) -> Program:
 
 def judging(pool: Pool, size: Size, trains: bool) -> list[Program]:
     """Return programs that decide levels before and after training."""
-    config, rules, rounds = pool.config, pool.rules, pool.procedure.search.steady
+    config, rules, rounds = pool.config, pool.rules, pool.procedure.search.robustness
     some = lambda count: (levels_of(size, count), ids_of(count))
     acted = lambda count, dtype: jax.ShapeDtypeStruct((RECORD_STEPS, ACTIONS, count), dtype)
     programs = [
@@ -114,8 +114,8 @@ def judging(pool: Pool, size: Size, trains: bool) -> list[Program]:
         given = *some(one), acted(one, np.int8), ids_of(one), config.replays, rules
         programs.append(Program(portability.survival_block, lambda: (given, {})))
     if config.replays and rounds:
-        few = at_once(steady.KEPT * steady.STARTS, rework.IN_CACHE)
-        programs.append(Program(steady.steady, lambda: ((*some(few), no_success(few), rounds, rules), {})))
+        few = at_once(strengthen.KEPT * strengthen.STARTS, rework.IN_CACHE)
+        programs.append(Program(strengthen.strengthen, lambda: ((*some(few), no_success(few), rounds, rules), {})))
     if trains:
         count = at_once(config.attempts, afresh.IN_CACHE)
         params = lambda: begin.eval_shape(*some(count), no_success(count), config).training.train_state.params
@@ -140,7 +140,7 @@ LONGEST = (
     begin,
     vary.vary_rounds,
     afresh.attempt_block,
-    steady.steady,
+    strengthen.strengthen,
     replay_block,
     explore.begin,
     examine,

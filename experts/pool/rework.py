@@ -1,4 +1,4 @@
-"""Rework of witnesses before they count: polish them if configured, and steady them if replays fail."""
+"""Rework of witnesses before they count: polish them if configured, and strengthen them if replays fail."""
 
 from collections.abc import Callable, Sequence
 
@@ -8,7 +8,7 @@ from jaxtyping import Int
 
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.labels import BY_EXPERT, Source
-from levelproof.experts.pool.steady import KEPT, STARTS, steady
+from levelproof.experts.pool.strengthen import KEPT, STARTS, strengthen
 from levelproof.experts.procedure import Procedure
 from levelproof.experts.search.shorten import LANES, Shortened, polish
 from levelproof.experts.verdict.judge import Witness, repeating
@@ -62,10 +62,10 @@ def rework(
 
     if search.polish:
         improve(range(len(witnesses)), LANES, lambda *args: polish(*args, search.polish, rules))
-    if search.steady and replays:
+    if search.robustness and replays:
         enough = lambda witness: OWN if witness.source in BY_EXPERT else PORTABLE
         fragile = [i for i, witness in enumerate(witnesses) if witness and (witness.portability or 0) < enough(witness)]
-        improve(fragile, KEPT * STARTS, lambda *args: steady(*args, search.steady, rules))
+        improve(fragile, KEPT * STARTS, lambda *args: strengthen(*args, search.robustness, rules))
     return witnesses, env_steps
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Int
 from levelproof.experts.config import MAX_COUNTED
 from levelproof.physics.bounds import require
 
-MAX_ROUNDS = 1024  # limit of `trials` and `steady`
+MAX_ROUNDS = 1024  # limit of `trials` and `robustness`
 MAX_RUNGS = 16  # each rung is four times the one before, and env steps are counted in 32 bits
 MAX_ENTRIES = 16_384  # sums of their weights (`experts.search.archive`) must fit 32 bits
 
@@ -36,15 +36,15 @@ class SearchConfig:
     per_cell: int = 512  # maximum env steps per cell reached for a level to pass a rung; 0: no limit
     # play
     lanes: int = 64  # lanes per level
-    redrawn: tuple[float, ...] = (
+    resample: tuple[float, ...] = (
         0.02,
         0.05,
         0.1,
         0.3,
     )  # probability of resampling an entry of the action, per env step
     segment: int = 8  # env steps between visits to the archive
-    stretch: int = 4  # segments that a lane plays before it returns to an archived state
-    anew: float = 0.5  # share of returns that start with a new random action; others repeat the archived state's last
+    segments: int = 4  # segments that a lane plays before it returns to an archived state
+    new_action: float = 0.5  # share of returns that start with a new random action; others repeat the state's last
     # archive
     entries: int = 512  # archived states per level
     nearer: float = 0.5  # share of returns that draw two states and pick the one nearer to the goal
@@ -56,7 +56,7 @@ class SearchConfig:
     trials: int = 4  # rounds of attempts to shorten a success, one per lane; the first also verifies it
     # a witness
     polish: int = 0  # env steps of search around a witness for a shorter one, rounded up to whole rounds; 0: none
-    steady: int = 8  # rounds of search around a fragile witness for a more robust one; 0: none
+    robustness: int = 8  # rounds of search around a fragile witness for a more robust one; 0: none
     # machine
     rounds: int = 2  # rounds per device call, between host syncs
 
@@ -64,23 +64,23 @@ class SearchConfig:
         require(self, ("bodies", "per_cell", "patience"), 0, MAX_COUNTED)
         # half of MAX_COUNTED leaves room for the excess of the last round
         require(self, ("env_steps", "variations", "polish"), 0, MAX_COUNTED // 2)
-        require(self, ("steady",), 0, MAX_ROUNDS)
+        require(self, ("robustness",), 0, MAX_ROUNDS)
         require(self, ("trials",), 1, MAX_ROUNDS)
-        require(self, ("lanes", "segment", "stretch", "rounds", "first_rung"), 1)
+        require(self, ("lanes", "segment", "segments", "rounds", "first_rung"), 1)
         require(self, ("entries",), 1, MAX_ENTRIES)
-        require(self, ("nearer", "anew"), 0, 1)
+        require(self, ("nearer", "new_action"), 0, 1)
         require(self, ("width",), 0, above=True)
         require(self, ("growth",), 1, above=True)
         require(self, ("driven_weight",), 0)
-        if not self.redrawn or not all(0 < chance <= 1 for chance in self.redrawn):
-            raise ValueError(f"redrawn is {self.redrawn}: give probabilities above 0 and at most 1")
-        if self.lanes % len(self.redrawn):
+        if not self.resample or not all(0 < chance <= 1 for chance in self.resample):
+            raise ValueError(f"resample is {self.resample}: give probabilities above 0 and at most 1")
+        if self.lanes % len(self.resample):
             raise ValueError(
-                f"lanes is {self.lanes}: give a multiple of {len(self.redrawn)}, the number of probabilities in redrawn"
+                f"lanes is {self.lanes}: give a multiple of {len(self.resample)}, the probabilities in resample"
             )
         if self.steps_per_round > MAX_COUNTED // 4:
             raise ValueError(
-                f"lanes is {self.lanes}: a round of lanes x stretch x segment env steps is too long: lower one of them"
+                f"lanes is {self.lanes}: a round of lanes x segments x segment env steps is too long: lower one of them"
             )
 
     def scaled(self, bodies: int) -> "SearchConfig":
@@ -95,7 +95,7 @@ class SearchConfig:
     @property
     def steps_per_round(self) -> int:
         """Env steps of one level between two returns to the archive."""
-        return self.lanes * self.stretch * self.segment
+        return self.lanes * self.segments * self.segment
 
     @property
     def ends(self) -> StopLimits:
@@ -108,5 +108,5 @@ class SearchConfig:
     def endless(self) -> "SearchConfig":
         """This configuration without limits and rework: equal for all configurations that share compiled programs."""
         return replace(
-            self, env_steps=0, bodies=0, variations=0, patience=0, first_rung=1, per_cell=0, polish=0, steady=0
+            self, env_steps=0, bodies=0, variations=0, patience=0, first_rung=1, per_cell=0, polish=0, robustness=0
         )

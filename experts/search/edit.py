@@ -24,7 +24,7 @@ class Draws(IntEnum):
 
     SHORTEN = 1
     POLISH = 2
-    STEADY = 3
+    STRENGTHEN = 3
     VARY = 4
 
 

@@ -44,9 +44,9 @@ class RoundDraws(NamedTuple):
     """Random draws of one level's round."""
 
     choice: Float[Array, "3 lane"]  # uniform, to choose an archive entry
-    anew: Bool[Array, " lane"]  # whether a lane starts with a new action instead of the entry's last one
+    new_action: Bool[Array, " lane"]  # whether a lane starts with a new action instead of the entry's last one
     code: UInt16[Array, " lane"]  # code of that action
-    bits: UInt32[Array, "stretch time 6 lane"]  # bits for the actions that follow
+    bits: UInt32[Array, "segment time 6 lane"]  # bits for the actions that follow
 
 
 @partial(jax.jit, static_argnames=("config", "rules"))
@@ -80,7 +80,7 @@ def explore(search: Search, config: SearchConfig, rules: TaskParams) -> Search:
 
 @partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="search")
 def explore_rounds(search: Search, ends: StopLimits, config: SearchConfig, rules: TaskParams) -> Search:
-    ring = arena(search.levels, config.lanes, config.redrawn)
+    ring = arena(search.levels, config.lanes, config.resample)
     step = lambda search, _: (explore_round(search, ring, ends, config, rules), None)
     return jax.lax.scan(step, search, length=config.rounds)[0]
 
@@ -89,11 +89,11 @@ def explore_round(search: Search, ring: Arena, ends: StopLimits, config: SearchC
     """Search for one round; `ring` has the levels' lanes."""
     active = under_way(search, ends)
     chance = jax.vmap(partial(draw, config=config))(search.level_ids, search.env_steps)
-    bits = jnp.moveaxis(chance.bits, 0, 3).reshape(config.stretch, config.segment, ACTIONS, -1)
+    bits = jnp.moveaxis(chance.bits, 0, 3).reshape(config.segments, config.segment, ACTIONS, -1)
     chosen = choose(search.archive, chance.choice, config)
     walk, code = back_to(search, chosen)
     drawn = jnp.where(ring.live, decode(chance.code.reshape(-1)), 0)
-    walk = walk._replace(action=jnp.where(chance.anew.reshape(-1), drawn, walk.action))
+    walk = walk._replace(action=jnp.where(chance.new_action.reshape(-1), drawn, walk.action))
 
     def one(carry: tuple[Archive, Walk, Array, Array], bits: Array) -> tuple[tuple, None]:
         archive, walk, code, least = carry
@@ -147,8 +147,8 @@ def draw(level_id: Int[Array, ""], env_steps: Int[Array, ""], config: SearchConf
     """Draw all random numbers of one level's round."""
     one, other = jax.random.split(jax.random.fold_in(key_for(level_id, Stream.SEARCH), env_steps))
     uniform = jax.random.uniform(one, (5, config.lanes))
-    bits = jax.random.bits(other, (config.stretch, config.segment, ACTIONS, config.lanes))
-    return RoundDraws(uniform[:3], uniform[3] < config.anew, (uniform[4] * CODES).astype(jnp.uint16), bits)
+    bits = jax.random.bits(other, (config.segments, config.segment, ACTIONS, config.lanes))
+    return RoundDraws(uniform[:3], uniform[3] < config.new_action, (uniform[4] * CODES).astype(jnp.uint16), bits)
 
 
 def back_to(search: Search, chosen: Int[Array, "level lane"]) -> tuple[Walk, UInt16[Array, "lane step"]]:

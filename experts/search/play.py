@@ -46,7 +46,7 @@ class Arena(NamedTuple):
     blue: Bool[Array, "contact lane"]  # contacts that reach the goal
     red: Bool[Array, "contact lane"]  # contacts that end the episode without success
     goals: Goals  # pairs of bodies whose gap measures the distance to the goal
-    redrawn: Float[Array, " lane"]  # probability of resampling an entry of the action, per env step
+    resample: Float[Array, " lane"]  # probability of resampling an entry of the action, per env step
 
 
 class Walk(NamedTuple):
@@ -64,11 +64,11 @@ def most_steps(rules: TaskParams) -> int:
     return min(RECORD_STEPS, rules.max_timesteps)
 
 
-def arena(levels: Level, lanes: int, redrawn: tuple[float, ...]) -> Arena:
-    """Spread each level over `lanes` neighbouring lanes, an equal share for each probability in `redrawn`."""
+def arena(levels: Level, lanes: int, resample: tuple[float, ...]) -> Arena:
+    """Spread each level over `lanes` neighbouring lanes, an equal share for each probability in `resample`."""
     count = levels.role.shape[-1]
     spread = repeat(levels, lanes)
-    chance = jnp.tile(jnp.repeat(jnp.array(redrawn, jnp.float32), lanes // len(redrawn)), count)
+    chance = jnp.tile(jnp.repeat(jnp.array(resample, jnp.float32), lanes // len(resample)), count)
     touching = contacts(spread, Role.BLUE), contacts(spread, Role.RED)
     return Arena(spread, action_mask(spread), *touching, goals_of(spread), chance)
 
@@ -103,8 +103,8 @@ def persistent(action: Int[Array, "6 lane"], bits: UInt32[Array, "6 lane"], aren
     """Resample some entries of the action; one random number per entry decides both whether and to which choice."""
     choices = jnp.array(CHOICES, jnp.float32)[:, None]
     uniform = (bits >> 8).astype(jnp.float32) * 2.0**-24
-    drawn = jnp.minimum(uniform / arena.redrawn * choices, choices - 1).astype(jnp.int32)
-    return jnp.where((uniform < arena.redrawn) & arena.live, drawn, action)
+    drawn = jnp.minimum(uniform / arena.resample * choices, choices - 1).astype(jnp.int32)
+    return jnp.where((uniform < arena.resample) & arena.live, drawn, action)
 
 
 def act(arena: Arena, walk: Walk, action: Int[Array, "6 lane"], rules: TaskParams) -> Walk:

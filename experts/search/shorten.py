@@ -57,7 +57,7 @@ def shorten(
         config: its settings give lanes and rounds.
         rules: the task's rules.
     """
-    ring = arena(levels, config.lanes, config.redrawn)
+    ring = arena(levels, config.lanes, config.resample)
 
     def trial(number: Int[Array, ""], now: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         code, length, env_steps = now

@@ -205,7 +205,7 @@ def played(episodes: Episodes, ring: Arena, config: SearchConfig, rules: TaskPar
     walk = fresh_walk(ring.lanes)._replace(
         state=from_rows(flat(episodes.state), ring.lanes.state), timestep=flat(episodes.timestep)
     )
-    walk, least, steps = jax.lax.scan(one, (walk, least, steps), length=config.stretch * config.segment)[0]
+    walk, least, steps = jax.lax.scan(one, (walk, least, steps), length=config.segments * config.segment)[0]
     shape = episodes.over.shape
     return walk, Approaches(episodes.so_far.code, least.reshape(shape), steps.reshape(shape))
 

@@ -31,7 +31,7 @@ from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.rules import TaskParams
 
 STICKINESS = 0.25  # probability of repeating the last action in sticky attempts (Machado et al. 2018, arXiv:1709.06009)
-MOVED = 0.1  # m/s and rad/s, maximum perturbation of the level's velocities in moved attempts
+PERTURBATION = 0.1  # m/s and rad/s, largest change of the level's velocities in perturbed attempts
 
 
 def over_slots(function: Callable, *slots: Any) -> Any:
@@ -59,7 +59,7 @@ def advance(slots: Slots, config: ExpertConfig, stopping: StopRules, rules: Task
     trains = repeat(~evaluating, config.environments)
     fresh = repeat(slot.trial.part == 0, config.environments)
     training, trial = lanes_of(slots.acting), lanes_of(slots.trial)
-    acting = _where(trains, training, _where(fresh, _moved_start(lanes, keys, config), trial))
+    acting = _where(trains, training, _where(fresh, _perturbed_start(lanes, keys, config), trial))
 
     network = network_of(levels.size, config)
     manner = _manner(slot, evaluating, config)
@@ -80,7 +80,7 @@ def advance(slots: Slots, config: ExpertConfig, stopping: StopRules, rules: Task
 def train_on(slots: Slots, stays: Bool[Array, " slot"], stopping: StopRules) -> Slots:
     """Resume training in slots marked in `stays`, for a witness that more replays survive; donates `slots`."""
     slot = slots.slot
-    course, deadline = stop.steady_on(slot.training.course, slot.deadline, stopping)
+    course, deadline = stop.train_on(slot.training.course, slot.deadline, stopping)
     keep = lambda new, old: jax.tree.map(lambda a, b: jnp.where(stays, a, b), new, old)
     slot = slot._replace(
         mode=keep(jnp.full_like(slot.mode, Mode.TRAIN), slot.mode),
@@ -210,7 +210,7 @@ def _key(level_id: Int[Array, ""], slot: Slot) -> Key[Array, ""]:
 def _manner(slot: Slot, evaluating: Bool[Array, " slot"], config: ExpertConfig) -> ActionRule:
     """Choose how each lane acts.
 
-    Evaluation: plain attempts first, then sticky and moved ones. Training: rehearsals in the last environments.
+    Evaluation: plain attempts first, then sticky and perturbed ones. Training: rehearsals in the last environments.
     """
     number = jnp.arange(config.environments)
     sticky = (number >= config.attempts) & (number < config.attempts + config.sticky_attempts)
@@ -228,20 +228,22 @@ def _manner(slot: Slot, evaluating: Bool[Array, " slot"], config: ExpertConfig) 
     )
 
 
-def _moved_start(lanes: Level, keys: Key[Array, " slot"], config: ExpertConfig) -> Acting:
-    """Reset each lane to its level's first state, with perturbed velocities in moved attempts."""
+def _perturbed_start(lanes: Level, keys: Key[Array, " slot"], config: ExpertConfig) -> Acting:
+    """Reset each lane to its level's first state, with changed velocities in perturbed attempts."""
     number = jnp.arange(config.environments)
     first = config.attempts + config.sticky_attempts
-    moved = jnp.tile((number >= first) & (number < first + config.moved_attempts), len(keys))
+    perturbed = jnp.tile((number >= first) & (number < first + config.perturbed_attempts), len(keys))
     acting = start(lanes)
     state, movable = acting.world.state, (lanes.model.inverse_mass > 0) & lanes.model.active
 
     def noise(key):
         shape = (3, len(movable), config.environments)
-        return jax.random.uniform(jax.random.fold_in(key, config.horizon), shape, minval=-MOVED, maxval=MOVED)
+        return jax.random.uniform(
+            jax.random.fold_in(key, config.horizon), shape, minval=-PERTURBATION, maxval=PERTURBATION
+        )
 
     drawn = jnp.moveaxis(jax.vmap(noise)(keys), 0, -2).reshape(3, len(movable), -1)
-    drawn = jnp.where(movable & moved, drawn, 0.0)
+    drawn = jnp.where(movable & perturbed, drawn, 0.0)
     state = replace(
         state,
         velocity=state.velocity + jnp.moveaxis(drawn[:2], 0, 1),

@@ -22,7 +22,7 @@ class StopRules(NamedTuple):
     share: np.float32  # share of finished episodes that must reach the goal to trigger an evaluation
     wait: np.int32  # updates between a failed evaluation and the next; doubles each time
     polish: np.int32  # updates after the level is solved
-    steady: np.int32  # updates after the level is solved by fragile witnesses
+    robustness: np.int32  # updates after the level is solved by fragile witnesses
     first_rung: np.int32  # updates at the first rung
     gain: np.float32  # minimum growth of the best return between rungs
     fruitless: np.int32  # updates after which an expert without a success leaves
@@ -37,7 +37,7 @@ def rules_of(stopping: StopConfig, config: ExpertConfig) -> StopRules:
         share=np.float32(stopping.share),
         wait=np.int32(config.updates_in(stopping.wait)),
         polish=np.int32(config.updates_in(stopping.polish) if stopping.polish else 0),
-        steady=np.int32(config.updates_in(stopping.steady) if stopping.steady else 0),
+        robustness=np.int32(config.updates_in(stopping.robustness) if stopping.robustness else 0),
         first_rung=np.int32(config.updates_in(stopping.first_rung)),
         gain=np.float32(stopping.gain),
         fruitless=np.int32(config.updates_in(stopping.fruitless) if stopping.fruitless else LAST),
@@ -117,10 +117,10 @@ def after_evaluation(
     return course, leaves, deadline
 
 
-def steady_on(course: StopState, deadline: Int[Array, "..."], rules: StopRules) -> tuple[StopState, Int[Array, "..."]]:
+def train_on(course: StopState, deadline: Int[Array, "..."], rules: StopRules) -> tuple[StopState, Int[Array, "..."]]:
     """Return state and deadline of a solved level that trains on for a more robust witness."""
     course = course._replace(next_evaluation=course.updates + _wait(course, rules), failed=course.failed + 1)
-    return course, jnp.minimum(deadline, course.updates + rules.steady)
+    return course, jnp.minimum(deadline, course.updates + rules.robustness)
 
 
 def _wait(course: StopState, rules: StopRules) -> Int[Array, "..."]:

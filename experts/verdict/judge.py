@@ -153,7 +153,7 @@ def verdict_of(
         reason = solved_reason(source, episodes)
         return untrained(Label.SOLVED, reason, failed_by_noop, source, steps, portability)
     last = trained.evaluations[-1]
-    attempts, sticky, moved = shares(last, config)
+    attempts, sticky, perturbed = shares(last, config)
     first, env_steps = (int(x) for x in (last.progress.first_success, last.progress.env_steps))
     if witness is not None:
         reason = solved_reason(witness.source, episodes)
@@ -167,7 +167,7 @@ def verdict_of(
         success_rate=attempts,
         most_probable_succeeds=bool(succeeds(last.done[:, 0], last.goal[:, 0])),
         sticky_success_rate=sticky,
-        moved_success_rate=moved,
+        perturbed_success_rate=perturbed,
         steps_to_goal=None if witness is None else witness.steps,
         steps_to_first_success=None if first == NEVER else first,
         env_steps=env_steps,
@@ -180,7 +180,7 @@ def verdict_of(
 
 
 def shares(evaluation: Evaluation, config: ExpertConfig) -> tuple[float, float, float]:
-    """Return success rates of sampled, sticky and moved attempts, over their first episodes (NaN: no such attempts).
+    """Return success rates of sampled, sticky and perturbed attempts over first episodes (NaN: no such attempts).
 
     Later episodes would count quick successes several times and slow failures never, and do not start with perturbed
     velocities. An episode that does not end within the record is a failure.
@@ -189,6 +189,6 @@ def shares(evaluation: Evaluation, config: ExpertConfig) -> tuple[float, float, 
     first = done.any(0) & goal[np.argmax(done, 0), np.arange(done.shape[1])]
     sampled = first[1 : config.attempts]  # the first takes the most probable actions
     sticky = first[config.attempts : config.attempts + config.sticky_attempts]
-    moved = first[config.attempts + config.sticky_attempts :][: config.moved_attempts]
+    perturbed = first[config.attempts + config.sticky_attempts :][: config.perturbed_attempts]
     mean = lambda x: float(x.mean()) if len(x) else float("nan")
-    return mean(sampled), mean(sticky), mean(moved)
+    return mean(sampled), mean(sticky), mean(perturbed)

@@ -25,8 +25,8 @@ it.
 |---|---|---|
 """
 END = """
-Manifests of version {oldest}, which had no {newer}, can be read, too: these columns are null there. `seconds` and \
-`versions` are structs: in SQL, write `seconds.training` and `versions.jax`.
+Manifests of version {oldest}, which had no {newer}, can be read, too: these columns are null there. {renamed} \
+`seconds` and `versions` are structs: in SQL, write `seconds.training` and `versions.jax`.
 
 More on [labels](labels.md) and their evidence, [content hashes and signatures](levels.md), \
 [portability](experts.md), and [seconds, shards and rows](storage.md). `levelproof columns --markdown` writes this \
@@ -68,9 +68,17 @@ def _type_and_unit(column: "ManifestColumn") -> str:
 
 def as_markdown() -> str:
     """Return the page docs/columns.md."""
-    from levelproof.pipeline.store.columns import DESCRIBED, MANIFEST_VERSION, OLDEST_VERSION
+    from levelproof.pipeline.store.columns import (
+        DESCRIBED,
+        MANIFEST_VERSION,
+        OLDEST_VERSION,
+        RENAMED,
+        RENAMING_VERSION,
+    )
 
     newer = " and ".join(f"`{column.name}`" for column in DESCRIBED if column.since > OLDEST_VERSION)
     rows = [f"| `{column.name}` | {_type_and_unit(column)} | {column.text} |" for column in DESCRIBED]
-    start, end = INTRODUCTION.format(version=MANIFEST_VERSION), END.format(oldest=OLDEST_VERSION, newer=newer)
+    renamed = " ".join(f"Before version {RENAMING_VERSION}, `{new}` was `{old}`." for old, new in RENAMED.items())
+    start = INTRODUCTION.format(version=MANIFEST_VERSION)
+    end = END.format(oldest=OLDEST_VERSION, newer=newer, renamed=renamed)
     return start + "\n".join(rows) + "\n" + end

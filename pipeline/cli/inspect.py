@@ -34,8 +34,10 @@ def run(arguments: argparse.Namespace) -> None:
     import sys
 
     from levelproof.pipeline.look.query import RowQuery, write_csv
+    from levelproof.pipeline.store.columns import with_current_names
 
-    columns = [name.strip() for name in arguments.columns.split(",")] if arguments.columns else None
+    names = with_current_names(arguments.columns).split(",") if arguments.columns else None
+    columns = names and [name.strip() for name in names]
     query = RowQuery(arguments.where, columns, arguments.sort, arguments.limit)
     if arguments.csv:
         return write_csv(arguments.split, query, sys.stdout)

@@ -29,7 +29,7 @@ class Ahead:
         folder, programs = cache_folder() / "jax", programs_of(pool, size_of(job.size))
         search = job.search.scaled(size_of(job.size).bodies)
         of_code = [entry for entry in program_of(job).items() if entry[0] != "configuration"]
-        settings = job.size, job.expert, search.endless, search.steady, job.task, of_code, device()
+        settings = job.size, job.expert, search.endless, search.robustness, job.task, of_code, device()
         self._seconds: list[float] = []  # time of each program that this process has compiled
         self._tracing = Lock()  # Python's part of compiling gains nothing from threads, and shares what it caches
         self._programs = {_claim(folder, program, repr(settings)): program for program in programs}

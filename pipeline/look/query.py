@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.read.select import TABLE, columns_in, select
-from levelproof.pipeline.store.columns import COLUMNS
+from levelproof.pipeline.store.columns import COLUMNS, with_current_names
 from levelproof.pipeline.store.manifest import require_manifest
 
 BLOCK = 2**14  # rows read at a time
@@ -49,7 +49,7 @@ def ids_of(table: pa.Table, query: RowQuery) -> np.ndarray:
             connection.register(TABLE, table)
             connection.execute("SET enable_external_access = false")
             try:
-                sql = f"SELECT level_id FROM {TABLE} ORDER BY {query.sort}\n NULLS LAST, level_id"
+                sql = f"SELECT level_id FROM {TABLE} ORDER BY {with_current_names(query.sort)}\n NULLS LAST, level_id"
                 ids = connection.sql(sql).fetchnumpy()["level_id"]
             except duckdb.Error as error:
                 reason = str(error).strip().splitlines()[0]

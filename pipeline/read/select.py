@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.store.columns import COLUMNS
+from levelproof.pipeline.store.columns import COLUMNS, with_current_names
 from levelproof.pipeline.store.manifest import require_manifest
 
 SOLVED = "label = 'solved'"  # default condition of exports
@@ -19,7 +19,7 @@ WILDCARDS = {TABLE, "columns"}  # words that may refer to every column in DuckDB
 
 def columns_in(where: str | None) -> list[str]:
     """Return the columns that a condition may refer to: those whose names are among its words."""
-    words = set(re.findall(r"\w+", (where or "").lower()))
+    words = set(re.findall(r"\w+", with_current_names(where or "").lower()))
     return [name for name in COLUMNS.names if name in words or words & WILDCARDS]
 
 
@@ -39,7 +39,9 @@ def select(table: pa.Table, where: str | None) -> pa.Table:
         connection.register(TABLE, table)
         connection.execute("SET enable_external_access = false")  # conditions must not read files
         try:
-            chosen = connection.sql(f"SELECT level_id FROM {TABLE} WHERE ({where}\n)").fetchnumpy()["level_id"]
+            chosen = connection.sql(f"SELECT level_id FROM {TABLE} WHERE ({with_current_names(where)}\n)").fetchnumpy()[
+                "level_id"
+            ]
         except duckdb.Error as error:
             reason = str(error).strip().splitlines()[0]
             columns = ", ".join(COLUMNS.names)

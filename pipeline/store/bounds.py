@@ -6,7 +6,7 @@ dictionaries, so that a short file cannot repeat a long string a million times, 
 small; strings without a dictionary are as long as their pages.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
@@ -101,7 +101,7 @@ class Bounded:
     def read(
         self,
         names: Sequence[str],
-        all_names: Sequence[str],
+        stored_as: Mapping[str, str],
         level_ids: np.ndarray | None = None,
         compact: bool = False,
     ) -> pa.Table:
@@ -109,14 +109,14 @@ class Bounded:
 
         Args:
             names: columns to read.
-            all_names: all columns that the file must have.
+            stored_as: names in the file of all columns that it must have.
             level_ids: levels whose row groups to read.
             compact: return repetitive columns as dictionaries.
 
         Raises:
             One of DAMAGE: the file is damaged, or would take too much memory.
         """
-        known = _expected(self._kind, tuple(all_names), self._are_plain)
+        known = _expected(self._kind, tuple(stored_as.values()), self._are_plain)
         if not self._file.schema.equals(known.schema) or not self._file.schema_arrow.equals(known.as_read):
             raise ValueError(f"its columns are not those of a {self._kind.name}")
         groups = range(len(self._groups))
@@ -124,8 +124,9 @@ class Bounded:
             matches = np.isin(self._read(known, groups, ["level_id"]).column(0).to_numpy(), level_ids)
             ends = np.cumsum([group.rows for group in self._groups])
             groups = np.unique(np.searchsorted(ends, np.flatnonzero(matches), "right")).tolist()
-        table, wanted = self._read(known, groups, names), _schema_of(self._kind, names, compact)
-        stored = {name: table.column(name) for name in names}
+        table = self._read(known, groups, [stored_as[name] for name in names])
+        wanted = _schema_of(self._kind, names, compact)
+        stored = {name: table.column(stored_as[name]) for name in names}
         expanded = [name for name, column in stored.items() if column.type != wanted.field(name).type]
         if any(map(_has_controls, (chunk for name in names if name != UNSEEN for chunk in stored[name].chunks))):
             raise ValueError("its strings contain control characters")

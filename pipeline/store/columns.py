@@ -3,14 +3,18 @@
 Readers refuse a fragment of an unknown version instead of guessing.
 """
 
+import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import pyarrow as pa
 
+from levelproof.configs.errors import warn_of_name
 from levelproof.experts.steps import Seconds
 
-MANIFEST_VERSION, OLDEST_VERSION = 8, 6  # written; still read
+MANIFEST_VERSION, OLDEST_VERSION = 9, 6  # written; still read
+RENAMING_VERSION = 9  # first with today's names
+RENAMED = {"moved_success_rate": "perturbed_success_rate"}  # today's names by those of earlier versions
 
 # Columns that depend on the run and not on the level: in all others two runs of a job agree, bit for bit
 OF_THE_RUN = ("shard", "row", "experts", "seconds")
@@ -106,7 +110,7 @@ DESCRIBED = (
         NO_ATTEMPTS,
     ),
     ManifestColumn(
-        "moved_success_rate",
+        "perturbed_success_rate",
         pa.float32(),
         "First episodes of the last evaluation that reach the goal from perturbed starts (slightly different "
         "velocities)",
@@ -194,8 +198,16 @@ DESCRIBED = (
     ),
 )
 COLUMNS = pa.schema([pa.field(column.name, column.type, nullable=bool(column.null)) for column in DESCRIBED])
-VERSIONS = {
-    str(version): [column.name for column in DESCRIBED if column.since <= version]
+
+
+def stored_names(names: Sequence[str], renamed: bool) -> dict[str, str]:
+    """Map columns to their names in a file, which are today's if it was written after they were `renamed`."""
+    old = {} if renamed else {new: old for old, new in RENAMED.items()}
+    return {name: old.get(name, name) for name in names}
+
+
+VERSIONS = {  # names of the columns of each version by today's names
+    str(version): stored_names([c.name for c in DESCRIBED if c.since <= version], version >= RENAMING_VERSION)
     for version in range(OLDEST_VERSION, MANIFEST_VERSION + 1)
 }
 
@@ -206,8 +218,8 @@ def schema_of(
     columns: pa.Schema = COLUMNS,
     repetitive: Sequence[str] = REPETITIVE,
 ) -> pa.Schema:
-    """Return the schema of the named columns; `compact`: with repetitive ones as dictionaries."""
-    fields = [columns.field(name) for name in names]
+    """Return the schema of columns, by any version's names; `compact`: with repetitive ones as dictionaries."""
+    fields = [columns.field(RENAMED.get(name, name)).with_name(name) for name in names]
     if compact:
         as_dictionary = pa.dictionary(pa.int32(), pa.string())
         fields = [field.with_type(as_dictionary) if field.name in repetitive else field for field in fields]
@@ -220,3 +232,12 @@ def completed(table: pa.Table, requested: Sequence[str]) -> pa.Table:
         if column.name in requested and column.name not in table.column_names:
             table = table.append_column(COLUMNS.field(column.name), pa.nulls(table.num_rows, column.type))
     return table
+
+
+def with_current_names(text: str) -> str:
+    """Replace names of columns in the last version, in SQL or alone, by today's; warns of each."""
+    for old, new in RENAMED.items():
+        text, found = re.subn(rf"\b{old}\b", new, text, flags=re.IGNORECASE)
+        if found:
+            warn_of_name("the column", old, new)
+    return text

@@ -28,7 +28,7 @@ from levelproof.pipeline.errors import Exit, UserError
 from tests.experts.small import untouched
 
 SMALL = ExpertConfig(
-    environments=16, width=16, rehearsals=4, attempts=4, sticky_attempts=4, moved_attempts=4, slots=4
+    environments=16, width=16, rehearsals=4, attempts=4, sticky_attempts=4, perturbed_attempts=4, slots=4
 )  # fmt: skip
 FIRST = 1_000_000
 
@@ -107,7 +107,7 @@ def test_variants_change_one_thing() -> None:
 
 def test_original_equals_reference_except_extra_attempts() -> None:
     original_variant, reference_variant = VARIANTS["original"], VARIANTS["reference"]
-    expert = replace(original_variant.procedure.expert, sticky_attempts=8, moved_attempts=8)
+    expert = replace(original_variant.procedure.expert, sticky_attempts=8, perturbed_attempts=8)
     assert replace(original_variant.procedure, expert=expert) == reference_variant.procedure
 
 

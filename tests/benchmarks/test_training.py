@@ -14,7 +14,7 @@ from levelproof.levelgen.sampling.sampler import sample_levels
 
 pytestmark = pytest.mark.campaign
 CONFIG = ExpertConfig(
-    environments=8, horizon=8, width=8, encoding=8, attempts=1, sticky_attempts=0, moved_attempts=0, rehearsals=0
+    environments=8, horizon=8, width=8, encoding=8, attempts=1, sticky_attempts=0, perturbed_attempts=0, rehearsals=0
 )
 
 

@@ -11,7 +11,7 @@ from levelproof.levelgen.task.rules import DEFAULT_RULES
 
 IDS = np.array([0, 2, 3, 4, 6, 7, 9])  # levels of size s that need an expert
 CONFIG = ExpertConfig(
-    environments=16, horizon=32, width=16, attempts=4, sticky_attempts=4, moved_attempts=4, slots=2, rehearsals=2
+    environments=16, horizon=32, width=16, attempts=4, sticky_attempts=4, perturbed_attempts=4, slots=2, rehearsals=2
 )
 SHAPED = replace(DEFAULT_RULES, dense_reward_scale=CONFIG.dense_reward_scale)  # as a pool has them
 WHOLE = StopConfig(rule=Rule.BUDGET)

@@ -9,6 +9,7 @@ from typing import Any, TypeVar, get_type_hints
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pyarrow as pa
 
 from levelproof.configs.compose import compose_job
 from levelproof.configs.schema import JobConfig
@@ -26,7 +27,7 @@ from levelproof.physics.pairs import pairs_of
 from levelproof.physics.types import MAX_VERTICES, Size
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import commit
-from levelproof.pipeline.store.columns import OF_THE_RUN
+from levelproof.pipeline.store.columns import OF_THE_RUN, stored_names
 from levelproof.pipeline.store.contents import highest
 from levelproof.pipeline.store.fields import arrays_of, same_bits, tree_of
 from levelproof.pipeline.store.job_note import note_job
@@ -105,7 +106,7 @@ def made_verdict(label: Label = Label.SOLVED, **changes: Any) -> Verdict:
         success_rate=1.0 if solved else float("nan"),
         most_probable_succeeds=False,
         sticky_success_rate=0.5 if solved else float("nan"),
-        moved_success_rate=0.75 if solved else float("nan"),
+        perturbed_success_rate=0.75 if solved else float("nan"),
         steps_to_goal=17 if solved else None,
         portability=0.875 if solved else None,
         steps_to_first_success=640 if solved else None,
@@ -204,6 +205,12 @@ def made_split(folder: Path, units: Sequence[Sequence[Label]], *words: str) -> P
         first += len(labels)
     note_job(path, job, ["levelproof", "generate"], [(0, first - 1)])
     return path
+
+
+def renamed_before(table: pa.Table) -> pa.Table:
+    """Return a table whose columns have the names of earlier versions."""
+    renamed = table.rename_columns([*stored_names(table.column_names, renamed=False).values()])
+    return renamed.replace_schema_metadata(table.schema.metadata)
 
 
 def commit_copy(source: Path, number: int, split: Path) -> None:

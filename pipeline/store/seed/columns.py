@@ -8,9 +8,10 @@ from typing import Any
 import pyarrow as pa
 
 from levelproof.pipeline.store.bounds import FileKind
+from levelproof.pipeline.store.columns import stored_names
 from levelproof.pipeline.store.formats import CONFIG_KEY, HASH_KEY
 
-SEED_VERSION = "1"
+SEED_VERSION = "2"
 SEED_KEY = b"levelproof.seed_version"
 BUDGET_KEY = b"levelproof.budget"  # as typed
 CONTENT_KEY = b"levelproof.content_sha256"  # of the content hashes of each row group, as a JSON list
@@ -28,16 +29,18 @@ FIELDS = (
     pa.field("success_rate", pa.float32()),
     pa.field("most_probable_succeeds", pa.bool_(), nullable=False),
     pa.field("sticky_success_rate", pa.float32()),
-    pa.field("moved_success_rate", pa.float32()),
+    pa.field("perturbed_success_rate", pa.float32()),
     pa.field("portability", pa.float32()),
     pa.field("failed_by_noop", pa.bool_(), nullable=False),
     pa.field("file", pa.string()),
     pa.field("made_with", pa.string(), nullable=False),  # the manifest's `versions`, `engine` and `device`, as JSON
 )
 SCHEMA = pa.schema(FIELDS)
+# Names of the columns of each version by today's names
+VERSIONS = {"1": stored_names(SCHEMA.names, renamed=False), SEED_VERSION: stored_names(SCHEMA.names, renamed=True)}
 # Same name and meaning as in the manifest
 KEPT = (
-    "label", "steps_to_goal", "success_rate", "most_probable_succeeds", "sticky_success_rate", "moved_success_rate",
+    "label", "steps_to_goal", "success_rate", "most_probable_succeeds", "sticky_success_rate", "perturbed_success_rate",
     "portability", "failed_by_noop", "file",
 )  # fmt: skip
 ROW_GROUP = 2**16  # rows that are read or skipped together
@@ -59,7 +62,7 @@ WRITTEN: dict[str, Any] = {  # how pyarrow writes one
     "compression_level": 19,
     "use_dictionary": [
         "label", "label_reason", "source", "steps_to_goal", "success_rate", "sticky_success_rate",
-        "moved_success_rate", "portability", "file", "made_with",
+        "perturbed_success_rate", "portability", "file", "made_with",
     ],
     "column_encoding": {"level_id": "DELTA_BINARY_PACKED", **dict.fromkeys(BYTES, "DELTA_LENGTH_BYTE_ARRAY")},
     "write_page_checksum": True,

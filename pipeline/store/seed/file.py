@@ -23,10 +23,9 @@ from levelproof.pipeline.store.seed.columns import (
     BUDGET_KEY,
     CONTENT_KEY,
     ROW_GROUP,
-    SCHEMA,
     SEED_KEY,
-    SEED_VERSION,
     SEEDS,
+    VERSIONS,
 )
 from levelproof.pipeline.store.seed.packed import MAX_BYTES
 
@@ -75,10 +74,10 @@ def read_seed(
         with bounded(path, SEEDS) as file:
             metadata = file.metadata
             version = metadata.get(SEED_KEY, b"?").decode()
-            if version != SEED_VERSION:
+            if version not in VERSIONS:
                 raise Failure(
                     f"The file {path} is not a seed file that this program reads (its version is {version[:9]!r}, not "
-                    f"{SEED_VERSION}): `levelproof export SPLIT --format seed` writes one."
+                    f"{' or '.join(VERSIONS)}): `levelproof export SPLIT --format seed` writes one."
                 )
             config, config_hash = settings_in(metadata[CONFIG_KEY], metadata[HASH_KEY].decode())
             budget, content = metadata[BUDGET_KEY].decode(), json.loads(metadata[CONTENT_KEY])
@@ -90,7 +89,7 @@ def read_seed(
                 raise ValueError("its metadata are not those of a seed file")
             fragment = Fragment(path, config_hash, config, {}, file.rows, True, frozenset({STORED}))
             wanted = list(dict.fromkeys(["level_id", *names]))
-            table = file.read(wanted, SCHEMA.names, level_ids, compact)
+            table = file.read(wanted, VERSIONS[version], level_ids, compact)
             _check(table)
     except FileNotFoundError:
         raise Failure(f"There is no seed file {path}: `levelproof export SPLIT --format seed` writes one.") from None

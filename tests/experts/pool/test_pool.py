@@ -125,7 +125,7 @@ def never_portable(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def steadied(updates: int) -> Pool:
     """Return a pool in which solved levels train on for `updates` updates, at most 10 in all."""
-    stopping = replace(SOLVED, steady=updates * CONFIG.steps_per_update)
+    stopping = replace(SOLVED, robustness=updates * CONFIG.steps_per_update)
     return Pool(10 * CONFIG.steps_per_update, untouched(stopping), DEFAULT_RULES)
 
 
@@ -155,7 +155,7 @@ def test_only_levels_with_fragile_witnesses_train_on(levels: Level) -> None:
 
 
 @pytest.mark.usefixtures("never_portable")
-def test_steady_limits_further_training(levels: Level) -> None:
+def test_stop_robustness_limits_further_training(levels: Level) -> None:
     """The learning curve extends the earlier one, and the best witness of all evaluations is kept."""
     at_once, waited = (trained_by(steadied(updates), levels) for updates in (0, 3))
     early = [i for i, level in enumerate(at_once) if level.candidates and len(level.curve) < 10]

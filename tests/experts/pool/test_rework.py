@@ -84,7 +84,7 @@ def test_rework_keeps_an_experts_own_witness_unless_most_replays_fail() -> None:
 
 def test_rework_without_rounds_or_replays_changes_nothing() -> None:
     for procedure in (
-        replace(PROCEDURE, search=replace(PROCEDURE.search, steady=0)),
+        replace(PROCEDURE, search=replace(PROCEDURE.search, robustness=0)),
         replace(PROCEDURE, expert=replace(PROCEDURE.expert, replays=0)),
     ):
         reworked, env_steps = rework(levels(), IDS, witnesses(), procedure, DEFAULT_RULES)

@@ -28,7 +28,7 @@ from tests.experts.search.worlds import broken, switchback, tower, valley
 from tests.experts.search.worlds import side_by_side as together
 
 CONFIG = SearchConfig(env_steps=262_144, variations=65_536, bodies=9, lanes=32, entries=128)
-ROUND = CONFIG.lanes * CONFIG.stretch * CONFIG.segment  # env steps
+ROUND = CONFIG.lanes * CONFIG.segments * CONFIG.segment  # env steps
 SWITCHBACK, VALLEY, BROKEN = range(3)
 KINDS = np.array([SWITCHBACK, VALLEY, BROKEN, SWITCHBACK, VALLEY, SWITCHBACK, VALLEY, SWITCHBACK, VALLEY])
 IDS = np.arange(700, 700 + len(KINDS), dtype=np.int32)
@@ -66,7 +66,7 @@ def begun() -> Search:
 @jax.jit
 def random_play(levels: Level, key: jax.Array) -> jax.Array:
     """Return whether each of 256 random episodes per level reaches the goal."""
-    ring = arena(levels, 256, CONFIG.redrawn)
+    ring = arena(levels, 256, CONFIG.resample)
     bits = jax.random.bits(key, (256, 6, 256 * levels.role.shape[-1]))
     return play(ring, fresh_walk(ring.lanes), bits, DEFAULT_RULES)[0].reached.reshape(-1, 256) > 0
 
@@ -321,11 +321,11 @@ def test_shorten_removes_detours() -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"lanes": 30}, {"entries": 0}, {"growth": 1.0}, {"width": 0.0}, {"nearer": 1.5}, {"anew": -0.5},
-     {"redrawn": (0.5, 2.0)}, {"redrawn": ()}, {"entries": 16_385}, {"env_steps": 2**31}, {"driven_weight": -1.0},
-     {"first_rung": 0}, {"per_cell": -1}, {"bodies": -1}, {"trials": 2000}, {"steady": 2000}, {"width": 1e-46},
+    [{"lanes": 30}, {"entries": 0}, {"growth": 1.0}, {"width": 0.0}, {"nearer": 1.5}, {"new_action": -0.5},
+     {"resample": (0.5, 2.0)}, {"resample": ()}, {"entries": 16_385}, {"env_steps": 2**31}, {"driven_weight": -1.0},
+     {"first_rung": 0}, {"per_cell": -1}, {"bodies": -1}, {"trials": 2000}, {"robustness": 2000}, {"width": 1e-46},
      {"growth": 1.00000001}, {"lanes": 2**28}, {"patience": -1}, {"variations": 2**31},
-     {"polish": -1}, {"polish": 2**31}, {"steady": -1}],
+     {"polish": -1}, {"polish": 2**31}, {"robustness": -1}],
 )  # fmt: skip
 def test_search_config_rejects_invalid_settings(wrong: dict) -> None:
     with pytest.raises(ValueError, match=f"^{next(iter(wrong))} is"):

@@ -93,7 +93,7 @@ def test_env_steps_are_limited() -> None:
 
 def test_run_polishes_witnesses() -> None:
     """A witness that does nothing stays."""
-    asked = SearchConfig(polish=ENV_STEPS, steady=0)
+    asked = SearchConfig(polish=ENV_STEPS, robustness=0)
     procedure = Procedure(search=asked, expert=ExpertConfig(replays=0))
     rough = [witness for pair in zip(*given(), strict=True) for witness in repeating(Success(*pair), Source.SAMPLED)]
     rough[0] = rough[0]._replace(source=Source.NOTHING)

@@ -82,7 +82,7 @@ def test_shuffled_gives_each_run_one_sample_per_environment(environments: int, h
         rehearsals=0,
         attempts=1,
         sticky_attempts=0,
-        moved_attempts=0,
+        perturbed_attempts=0,
     )
     shuffle = jax.jit(lambda seed: ppo.shuffled(jax.random.key(seed), config))
     orders = [np.asarray(shuffle(seed)) for seed in range(20)]
@@ -96,7 +96,7 @@ def test_shuffled_gives_each_run_one_sample_per_environment(environments: int, h
 
 def test_shuffled_can_put_every_sample_first() -> None:
     config = ExpertConfig(
-        environments=4, horizon=4, minibatches=1, rehearsals=0, attempts=1, sticky_attempts=0, moved_attempts=0
+        environments=4, horizon=4, minibatches=1, rehearsals=0, attempts=1, sticky_attempts=0, perturbed_attempts=0
     )
     many = jax.jit(jax.vmap(lambda key: ppo.shuffled(key, config)))
     orders = many(jax.random.split(jax.random.key(0), 4000))

@@ -12,7 +12,7 @@ from levelproof.experts.training import progress, stop
 from levelproof.experts.training.stop import rules_of
 
 CONFIG = ExpertConfig(
-    environments=16, horizon=64, attempts=8, sticky_attempts=4, moved_attempts=4
+    environments=16, horizon=64, attempts=8, sticky_attempts=4, perturbed_attempts=4
 )  # 1024 env steps an update
 SOLVED, HALVING = StopConfig(wait=2048, share=0.9), StopConfig(rule=Rule.HALVING, first_rung=4096, gain=0.1)
 
@@ -135,7 +135,7 @@ def test_solves_and_fails_count_attempts() -> None:
     done = np.zeros((256, 16), bool)
     goal = done.copy()
     done[[9, 255]] = goal[[9, 255]] = True
-    goal[255, 7:] = False  # one of the attempts, and all that are sticky or moved
+    goal[255, 7:] = False  # one of the attempts, and all that are sticky or perturbed
     assert bool(stop.solves(done, goal, rules, CONFIG))
     assert not bool(stop.fails(done, goal, 256, rules, CONFIG))
     goal[255, 1] = False

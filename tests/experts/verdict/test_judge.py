@@ -18,7 +18,7 @@ from levelproof.experts.verdict.judge import (
 )
 from levelproof.experts.witness.success import Success
 
-CONFIG = ExpertConfig(environments=8, rehearsals=2, attempts=3, sticky_attempts=2, moved_attempts=2)
+CONFIG = ExpertConfig(environments=8, rehearsals=2, attempts=3, sticky_attempts=2, perturbed_attempts=2)
 
 
 def evaluation(*episodes: list[tuple[int, bool]], success: int = 0, config: ExpertConfig = CONFIG) -> Evaluation:
@@ -82,7 +82,7 @@ def test_candidates_are_the_shortest_without_copies() -> None:
     candidates = candidates_of([one, one, one], Source.SCOUT, config)
     assert [witness.steps for witness in candidates] == [n for n in [*range(9, 20), 21] for _ in "123"]
     whole = [[(end, True)] for end in range(40, 10, -1)]
-    many = replace(CONFIG, environments=len(whole), attempts=len(whole), sticky_attempts=0, moved_attempts=0)
+    many = replace(CONFIG, environments=len(whole), attempts=len(whole), sticky_attempts=0, perturbed_attempts=0)
     shortest = candidates_of([evaluation(*whole, config=many)], Source.SCOUT, many)
     assert [witness.steps for witness in shortest] == list(range(12, 12 + MAX_CANDIDATES))
     assert len(candidates_of([one], Source.SCOUT, replace(config, replays=0))) == 1
@@ -104,7 +104,7 @@ def test_rehearsed_success_is_a_candidate_only_if_allowed_and_without_others() -
 
 
 def test_shares_count_first_episodes_of_each_kind_of_attempt() -> None:
-    """Attempts 0 to 2, two sticky, two moved, one spare; an unfinished first episode is a failure."""
+    """Attempts 0 to 2, two sticky, two perturbed, one spare; an unfinished first episode is a failure."""
     one = evaluation(
         [(9, False)],
         [(9, True), (19, True), (29, True)],
@@ -115,9 +115,9 @@ def test_shares_count_first_episodes_of_each_kind_of_attempt() -> None:
         [(3, True)],
         [(3, True)],
     )
-    rate, sticky, moved = shares(one, CONFIG)
-    assert (rate, sticky, moved) == (0.5, 0.5, 0.5)
-    nothing = shares(evaluation(), replace(CONFIG, sticky_attempts=0, moved_attempts=0))
+    rate, sticky, perturbed = shares(one, CONFIG)
+    assert (rate, sticky, perturbed) == (0.5, 0.5, 0.5)
+    nothing = shares(evaluation(), replace(CONFIG, sticky_attempts=0, perturbed_attempts=0))
     assert nothing[0] == 0
     assert np.isnan(nothing[1:]).all()
 

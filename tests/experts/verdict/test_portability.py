@@ -152,7 +152,7 @@ def test_choose_prefers_the_portable_of_two_candidates(levels: Level, witnesses:
 
 def labelled(monkeypatch: pytest.MonkeyPatch, levels: Level, replays: int) -> UnitResult:
     procedure = Procedure(
-        SearchConfig(env_steps=0, steady=0), ExpertConfig(replays=replays), StopConfig(rule=Rule.NONE)
+        SearchConfig(env_steps=0, robustness=0), ExpertConfig(replays=replays), StopConfig(rule=Rule.NONE)
     )
     searched_randomly(monkeypatch)
     return label(levels, IDS, 4096, procedure)

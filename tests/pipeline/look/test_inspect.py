@@ -48,7 +48,7 @@ def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("condition", "labels"),
     [
         ("sticky_success_rate > 0.4", {"solved": 3}),  # trivial levels have no such rate
-        ("moved_success_rate IS NULL", {"trivial": 3, "unsolved": 3, "unsolvable": 3}),
+        ("perturbed_success_rate IS NULL", {"trivial": 3, "unsolved": 3, "unsolvable": 3}),
         ("best_return > -1e30", {"solved": 3}),
         ("list_max(learning_curve) > 0.4", {"solved": 3, "trivial": 3, "unsolvable": 3, "unsolved": 3}),
         ("learning_curve[1] > 0.4", {}),

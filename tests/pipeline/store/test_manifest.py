@@ -28,7 +28,7 @@ from levelproof.pipeline.store.manifest import (
     require_manifest,
     write_fragment,
 )
-from tests.pipeline.made import made_job, made_verdict
+from tests.pipeline.made import made_job, made_verdict, renamed_before
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def test_read_manifest_sorts_rows_and_returns_every_column(tmp_path: Path, job: 
     assert row["learning_curve"] == [None, 0.5]
     assert row["command"] == "levelproof generate size=s budget=128k first_level=3 levels=1"
     nothing = manifest.table.to_pylist()[2]
-    rates = ("success_rate", "sticky_success_rate", "moved_success_rate")
+    rates = ("success_rate", "sticky_success_rate", "perturbed_success_rate")
     assert {
         nothing[name] for name in (*rates, "best_return", "steps_to_goal", "portability", "steps_to_first_success")
     } == {None}
@@ -161,15 +161,15 @@ def test_read_manifest_names_an_invalid_fragment(tmp_path: Path, job: JobConfig,
 def test_read_manifest_refuses_another_version(tmp_path: Path, job: JobConfig) -> None:
     path = commit(tmp_path, job, [0])
     table = pq.read_table(path)
-    metadata = {**(table.schema.metadata or {}), b"levelproof.manifest_version": b"9"}
+    metadata = {**(table.schema.metadata or {}), b"levelproof.manifest_version": b"10"}
     pq.write_table(table.replace_schema_metadata(metadata), path)
-    with pytest.raises(Failure, match="has manifest version 9, but this program reads versions 6 to 8"):
+    with pytest.raises(Failure, match="has manifest version 10, but this program reads versions 6 to 9"):
         read_manifest(tmp_path)
 
 
 def test_read_manifest_accepts_the_version_without_seconds(tmp_path: Path, job: JobConfig) -> None:
     path = commit(tmp_path, job, [0, 1])
-    table = pq.read_table(path)
+    table = renamed_before(pq.read_table(path))
     metadata = {**(table.schema.metadata or {}), b"levelproof.manifest_version": b"6"}
     pq.write_table(table.drop(["seconds", "engine"]).replace_schema_metadata(metadata), path)
     commit(tmp_path, job, [2])

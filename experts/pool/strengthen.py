@@ -1,4 +1,4 @@
-"""Steadying: search around a witness for one that survives more replays from perturbed starts.
+"""Strengthening: search around a witness for one that survives more replays from perturbed starts.
 
 In every round many lanes play variations of the witness. The shortest of those that reach the goal, and the
 witness itself, are replayed from perturbed starts; the one that survives most replays enters the next round, which
@@ -27,18 +27,18 @@ KEPT = 8  # successes per level that are replayed, the witness among them
 STARTS = 32  # perturbed starts of each
 
 
-class Steadying(NamedTuple):
-    """State of steadying, level first."""
+class Strengthening(NamedTuple):
+    """State of strengthening, level first."""
 
     code: UInt16[Array, "level step"]  # codes of the success's actions
     length: Int[Array, " level"]  # of the success, env steps
-    steady: Bool[Array, " level"]  # the witness has survived all replays of a round
+    robust: Bool[Array, " level"]  # the witness has survived all replays of a round
     env_steps: Int[Array, " level"]  # of all lanes
     number: Int[Array, ""]  # of rounds done
 
 
 @jit_quickly(static_argnames=("rounds", "rules"))
-def steady(
+def strengthen(
     levels: Level, level_ids: Int[Array, " level"], success: Success, rounds: int, rules: TaskParams
 ) -> Shortened:
     """Vary every success until one has survived all replays of a round.
@@ -54,9 +54,9 @@ def steady(
     ring, crowd = arena(levels, LANES, (1.0,)), arena(levels, KEPT * STARTS, (1.0,))
     few = repeat(levels, STARTS)
 
-    def one(now: Steadying) -> Steadying:
-        active = ~now.steady
-        new = edits(variation, now.code, now.length, draw(Draws.STEADY, level_ids, now.number, 10, LANES), ring)
+    def one(now: Strengthening) -> Strengthening:
+        active = ~now.robust
+        new = edits(variation, now.code, now.length, draw(Draws.STRENGTHEN, level_ids, now.number, 10, LANES), ring)
         new = new.at[:, 0].set(now.code)
         steps, _ = replayed(ring, new, jnp.where(active, now.length, 0), rules)
         kept = jnp.argsort(jnp.where(lane, steps * LANES + lane, 0), axis=-1)[:, :KEPT]
@@ -77,9 +77,9 @@ def steady(
         take = active & (most >= 0)
         code, length = best_lane(take, jnp.argmax(survived, axis=-1), (new, steps), (now.code, now.length))
         env_steps = now.env_steps + jnp.where(active, (LANES + KEPT * STARTS) * now.length, 0)
-        return Steadying(code, length, now.steady | (take & (most == STARTS)), env_steps, now.number + 1)
+        return Strengthening(code, length, now.robust | (take & (most == STARTS)), env_steps, now.number + 1)
 
     none = jnp.zeros(count, jnp.int32)
-    start = Steadying(code_of(success), success.length, success.length == 0, none, jnp.int32(0))
-    end = jax.lax.while_loop(lambda now: (now.number < rounds) & ~now.steady.all(), one, start)
+    start = Strengthening(code_of(success), success.length, success.length == 0, none, jnp.int32(0))
+    end = jax.lax.while_loop(lambda now: (now.number < rounds) & ~now.robust.all(), one, start)
     return Shortened(success_of(end.code, end.length), end.env_steps)
