@@ -1,6 +1,6 @@
 """Seeds against splits on a disk: bytes per level, and transitions/s of first episodes read in random batches.
 
-The same trajectories are read four ways: simulated from seeds, decoded from `full` shards that the seeds grew into,
+The same trajectories are read several ways: simulated from seeds, decoded from `full` shards that the seeds grew into,
 by the reference's own reader from an export of these, and, as the ceiling, stepped without any reading by
 `levelproof.Lanes`. Transitions of first episodes count, and none that repeats another.
 """
@@ -21,6 +21,7 @@ import levelproof
 from benchmarks import oracle
 from benchmarks.fresh import LANES, STEPS, in_lanes
 from benchmarks.report import Report, Table
+from levelproof.pipeline.dataset.dataset import EPISODES_AT_ONCE
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.runtime import own_cores, prepare_jax
 from levelproof.pipeline.store.seed.file import seed_files
@@ -73,8 +74,9 @@ def run(args: argparse.Namespace) -> Report:
             f"{PUBLISHED_LEVELS * per_level / 1e6:,.0f} MB, where the {PUBLISHED_LEVELS:,} of the released dataset, of "
             f"three sizes, take {PUBLISHED_BYTES / 1e9:,.0f} GB. Seeds keep first episodes; what follows in a released "
             "record of 256 steps are further episodes of the same expert, which seeds do not have.",
-            f"{TRAJECTORIES:,} trajectories from the page cache, with programs compiled before. *Seeds* are simulated; "
-            "*full* reads whole records of 256 steps, of which the first episode counts here; the *reference* returns "
+            f"{TRAJECTORIES:,} trajectories from the page cache, with programs compiled before. *Seeds* are simulated, "
+            "*full* shards decoded. *First episodes* come from `Dataset.episode_batches`; *records* from "
+            "`Dataset.read`, whole ones of 256 steps, of which the first episode counts here. The *reference* returns "
             "such records with every array copied, without an observation. *Lanes* plays random actions with "
             "observations, and reads nothing.",
         ],
@@ -118,7 +120,8 @@ def read(seeds: Path, part: Path, split: Path, seconds: float, alone: bool) -> t
     oracle.run_levelproof("export", seeds, "--format", "seed", "--where", within, "-o", part)
     oracle.run_levelproof("grow", part, "-o", split, "density=full", "executor=inline")
     ways = {"seeds": part, "full": split}
-    rates = {name: of_reader(path, seconds) for name, path in ways.items()}
+    rates = {f"{name}, first episodes": of_episodes(path, seconds) for name, path in ways.items()}
+    rates |= {f"{name}, records": of_records(path, seconds) for name, path in ways.items()}
     versions: dict[str, str] = {}
     if not alone:
         python, kinetix = oracle.oracle_python(), split.with_name("kinetix")
@@ -132,8 +135,16 @@ def read(seeds: Path, part: Path, split: Path, seconds: float, alone: bool) -> t
     return rates | {"Lanes": {"transitions": of_lanes(split.name, seconds)}}, versions
 
 
-def of_reader(path: Path, seconds: float) -> dict[str, float]:
-    """Read random batches; return transitions of first episodes and trajectories per second of CPU time."""
+def of_episodes(path: Path, seconds: float) -> dict[str, float]:
+    """Read random batches of first episodes; return transitions and trajectories per second of CPU time."""
+    batches = levelproof.open(path).episode_batches(BATCH, seed=0, observation=OBSERVATION, epochs=None)
+    transitions, count, spent = repeated(lambda: len(next(batches).reward), seconds, EPISODES_AT_ONCE // BATCH)
+    batches.close()
+    return {"transitions": transitions / spent, "trajectories": count * BATCH / spent}
+
+
+def of_records(path: Path, seconds: float) -> dict[str, float]:
+    """Read random batches of records; return transitions of first episodes and trajectories per second of CPU time."""
     data = levelproof.open(path)
     steps, draw = data.manifest["steps_to_goal"].to_numpy(), np.random.default_rng(0)
 
@@ -142,8 +153,8 @@ def of_reader(path: Path, seconds: float) -> dict[str, float]:
         data.read(chosen, observation=OBSERVATION)
         return int(steps[chosen].sum())
 
-    transitions, batches, spent = repeated(batch, seconds)
-    return {"transitions": transitions / spent, "trajectories": batches * BATCH / spent}
+    transitions, count, spent = repeated(batch, seconds)
+    return {"transitions": transitions / spent, "trajectories": count * BATCH / spent}
 
 
 def of_lanes(size: str, seconds: float) -> float:
@@ -161,11 +172,14 @@ def of_lanes(size: str, seconds: float) -> float:
     return steps / spent
 
 
-def repeated(work: Callable[[], int], seconds: float) -> tuple[int, int, float]:
-    """Repeat `work` for some CPU seconds, after two calls that compile; return its sum, the calls and the seconds."""
-    for _ in range(2):
+def repeated(work: Callable[[], int], seconds: float, together: int = 1) -> tuple[int, int, float]:
+    """Repeat `work` for some CPU seconds; return its sum, the calls and the seconds.
+
+    Calls come in groups of `together`, which share what they wait for. Two groups before the others compile.
+    """
+    for _ in range(2 * together):
         work()
     start, total, calls = time.process_time(), 0, 0
     while (spent := time.process_time() - start) < seconds:
-        total, calls = total + work(), calls + 1
+        total, calls = total + sum(work() for _ in range(together)), calls + together
     return total, calls, spent

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from levelproof.pipeline.dataset.dataset import Dataset as Dataset
     from levelproof.pipeline.dataset.dataset import open as open
     from levelproof.pipeline.dataset.environment import make as make
+    from levelproof.pipeline.dataset.episodes import EpisodeBatch as EpisodeBatch
     from levelproof.pipeline.dataset.sample import sample_data as sample_data
     from levelproof.pipeline.errors import Failure as Failure
     from levelproof.pipeline.errors import LevelproofError as LevelproofError
@@ -63,6 +64,7 @@ HOME = {
     "LevelFileError": "levelproof.levelgen.files.entries",
     "Batch": "levelproof.pipeline.dataset.batch",
     "Dataset": "levelproof.pipeline.dataset.dataset",
+    "EpisodeBatch": "levelproof.pipeline.dataset.episodes",
     "SIZES": "levelproof.levelgen.level",
     "EngineDiffers": "levelproof.pipeline.store.shard",
     "Distribution": "levelproof.levelgen.sampling.distribution",

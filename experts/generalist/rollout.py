@@ -15,9 +15,10 @@ from levelproof.levelgen.level import ACTIONS, Level
 from levelproof.levelgen.sampling.sampler import Sampler, sampler
 from levelproof.levelgen.task import environment
 from levelproof.levelgen.task.actions import action_mask
-from levelproof.levelgen.task.environment import EnvParams, ObservationType
+from levelproof.levelgen.task.environment import EnvParams
 from levelproof.levelgen.task.fresh import renewed
 from levelproof.levelgen.task.lanes import Lanes, LaneState, LevelTable, Table
+from levelproof.levelgen.task.observe.kinds import ObservationType
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.types import Size
 

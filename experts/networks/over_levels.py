@@ -22,9 +22,9 @@ from levelproof.experts.networks.relations import entity_tables
 from levelproof.experts.networks.transformer import MASKS, TransformerPolicy
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.sampling.scenery import empty_level
-from levelproof.levelgen.task.environment import ObservationType
 from levelproof.levelgen.task.observe.entities import entities
 from levelproof.levelgen.task.observe.flat import state_features
+from levelproof.levelgen.task.observe.kinds import ObservationType
 from levelproof.levelgen.task.observe.pixels import pixels
 from levelproof.physics.bounds import require
 from levelproof.physics.types import Size, State

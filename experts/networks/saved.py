@@ -20,7 +20,7 @@ from levelproof.experts.policy import most_probable, sample
 from levelproof.levelgen.identity.keys import key_of_seed
 from levelproof.levelgen.level import ACTIONS, Level, name_of, size_of
 from levelproof.levelgen.task.actions import action_mask
-from levelproof.levelgen.task.environment import ObservationType
+from levelproof.levelgen.task.observe.kinds import ObservationType
 from levelproof.levelgen.task.rules import TaskState
 from levelproof.physics.types import Size, State
 

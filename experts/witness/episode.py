@@ -19,30 +19,42 @@ from levelproof.levelgen.batching import blocks, take
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import controls
+from levelproof.levelgen.task.observe.kinds import ObservationType, constant_features, observe
 from levelproof.levelgen.task.rules import TaskParams, TaskState
 from levelproof.physics.buffers import zeros_of
 from levelproof.physics.types import Manifold
 
-# Lanes of a block, which ends with its longest episode. With more, most lanes would wait for the last one; with fewer
-# than the engine's kernel steps together, a block would be no faster
-SIDE_BY_SIDE = 16
-DISTANCE = "last_distance"
+# Lanes of a block, which ends with its longest episode: with more, lanes of few episodes would wait for the last one;
+# with fewer, a step of the engine would cost more per lane.
+FEW_LANES, MANY_LANES = 16, 64
+MANY = 512  # episodes from which on blocks have MANY_LANES, because neighbours in length differ little
+LENGTHS = (64, RECORD_STEPS)  # env steps that a block has room for: one program for each
 
 
 class PlayedEpisodes(NamedTuple):
-    """First episodes, level axis last. What lies after the last step of an episode has no meaning."""
+    """First episodes: their env steps are the rows of arrays, one episode after another, in the given order."""
 
-    fields: dict[str, Any]  # arrays of `Record` by path, [256, ..., level]
+    fields: dict[str, np.ndarray]  # arrays of `Record` by path, [row, ...]
+    observation: Any  # of the state before each action, [row, ...]; None if not requested
     checksum: UInt32[np.ndarray, " level"]  # of `checksum_of`
-    reaches: Any  # bool [level]: whether the episode ends at its last step and not before, at the goal
+    reaches: Bool[np.ndarray, " level"]  # whether the episode ends at its last step and not before, at the goal
 
 
-class _FirstEpisode(NamedTuple):
+class _PlayedBlock(NamedTuple):
+    """Episodes of a block; what lies after the last step of an episode has no meaning."""
+
+    rows: tuple[dict[str, Array], Any]  # fields by path and the observation, [step, lane, ...]
+    checksum: UInt32[Array, " lane"]
+    reaches: Bool[Array, " lane"]
+
+
+class _PlayingBlock(NamedTuple):
     step: Int[Array, ""]
     now: TaskState
     manifold: Any
+    end: TaskState  # before the last action of the episode, once there
     reaches: Bool[Array, " lane"]
-    fields: dict[str, Array]
+    rows: Any
 
 
 def play_episodes(
@@ -51,6 +63,7 @@ def play_episodes(
     steps: Int[np.ndarray, " level"],
     rules: TaskParams,
     fields: frozenset[str],
+    observation: ObservationType | None = None,
 ) -> PlayedEpisodes:
     """Play first episodes, those of similar length side by side.
 
@@ -60,60 +73,65 @@ def play_episodes(
         steps: lengths of the episodes, env steps, 1 to 256.
         rules: the task's rules.
         fields: paths of `Record` to return; anything else is not kept.
+        observation: type of the observation to return; None: none.
     """
-    count = len(steps)
-    order = np.argsort(steps, kind="stable")
-    given = take((level, action, steps.astype(np.int32)), order)
-    parts = [jax.device_get(_play_block(*take(given, lanes), rules, fields)) for lanes in blocks(count, SIDE_BY_SIDE)]
-    back = np.argsort(order)
-    return jax.tree.map(lambda *xs: np.concatenate(xs, -1)[..., :count][..., back], *parts)
+    count, first = len(steps), np.cumsum(steps) - steps
+    by_length = np.argsort(steps, kind="stable")
+    sums, reaches = np.zeros(count, np.uint32), np.zeros(count, bool)
+    rows: Any = None
+    for lanes in blocks(count, MANY_LANES if count >= MANY else FEW_LANES):
+        mine = by_length[lanes]
+        room = next(length for length in LENGTHS if length >= steps[mine[-1]])
+        given = take((level, action[:room], steps.astype(np.int32)), mine)
+        made: _PlayedBlock = jax.device_get(_play_block(*given, rules, fields, observation))
+        sums[mine], reaches[mine] = made.checksum, made.reaches
+        if rows is None:
+            rows = jax.tree.map(lambda x: np.empty((int(steps.sum()), *x.shape[2:]), x.dtype), made.rows)
+        pairs = [*zip(jax.tree.leaves(rows), jax.tree.leaves(made.rows), strict=True)]
+        for lane, i in enumerate(mine[: lanes[-1] - lanes[0] + 1].tolist()):  # without padding
+            for to, source in pairs:
+                to[first[i] : first[i] + steps[i]] = source[: steps[i], lane]
+    made_fields, shown = rows
+    return PlayedEpisodes(made_fields, shown, sums, reaches)
 
 
-@partial(jax.jit, static_argnames=("rules", "fields"))
+@partial(jax.jit, static_argnames=("rules", "fields", "observation"))
 def _play_block(
     level: Level,
-    action: Int[Array, "256 6 lane"],
+    action: Int[Array, "step 6 lane"],
     steps: Int[Array, " lane"],
     rules: TaskParams,
     fields: frozenset[str],
-) -> PlayedEpisodes:
+    observation: ObservationType | None,
+) -> _PlayedBlock:
     with_contacts = any(name.startswith("manifold/") for name in fields)
+    constant = constant_features(observation, level)
 
-    def act(playing: _FirstEpisode) -> _FirstEpisode:
+    def row(now: TaskState, manifold: Any, taken: Array, outcome: Any) -> Any:
+        made = paths_of(record_of(level, now, manifold, taken, outcome))
+        kept = {name: x for name, x in made.items() if name in fields}
+        shown = None if observation is None else observe(observation, level, now.state, constant)
+        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), (kept, shown))
+
+    def act(playing: _PlayingBlock) -> _PlayingBlock:
         step, now = playing.step, playing.now
-        taken = action[step]
-        after, outcome, _, contacts = task.advance_driven(level, now, controls(level, taken), rules, with_contacts)
-        made = paths_of(record_of(level, now, playing.manifold, taken, outcome))
+        after, outcome, _, contacts = task.advance_driven(
+            level, now, controls(level, action[step]), rules, with_contacts
+        )
         last = step == steps - 1
         right = (outcome.done == last) & (outcome.goal == last)
-        return _FirstEpisode(
-            step + 1,
-            after,
-            contacts,
-            playing.reaches & (right | (step >= steps)),
-            {name: jax.lax.dynamic_update_index_in_dim(x, made[name], step, 0) for name, x in playing.fields.items()},
-        )
+        put = lambda x, new: jax.lax.dynamic_update_index_in_dim(x, new, step, 0)
+        rows = jax.tree.map(put, playing.rows, row(now, playing.manifold, action[step], outcome))
+        end = jax.tree.map(lambda x, before: jnp.where(last, x, before), now, playing.end)
+        return _PlayingBlock(step + 1, after, contacts, end, playing.reaches & (right | (step >= steps)), rows)
 
     start = task.reset(level)
     contacts = zeros_of(Manifold, level.size, len(steps)) if with_contacts else None
-    row = jax.eval_shape(
-        lambda: paths_of(record_of(level, start, contacts, action[0], task.step(level, start, action[0], rules)[1]))
-    )
-    states = [f"state/{name}" for name in paths_of(start.state)]
-    checked = {*states, DISTANCE}  # by the checksum
-    empty = {name: jnp.zeros((RECORD_STEPS, *x.shape), x.dtype) for name, x in row.items() if name in fields | checked}
-    begun = _FirstEpisode(jnp.int32(0), start, contacts, jnp.ones(len(steps), bool), empty)
+    shapes = jax.eval_shape(lambda: row(start, contacts, action[0], task.step(level, start, action[0], rules)[1]))
+    empty = jax.tree.map(lambda x: jnp.zeros((len(action), *x.shape), x.dtype), shapes)
+    begun = _PlayingBlock(jnp.int32(0), start, contacts, start, jnp.ones(len(steps), bool), empty)
     over = jax.lax.while_loop(lambda playing: playing.step < steps.max(), act, begun)
-    at_end = lambda name: jnp.take_along_axis(over.fields[name], _along(steps - 1, over.fields[name]), 0)[0]
-    leaves = [at_end(name) for name in states]
-    end = TaskState(jax.tree.unflatten(jax.tree.structure(start.state), leaves), steps - 1, at_end(DISTANCE))
-    kept = {name: x for name, x in over.fields.items() if name in fields}
-    return PlayedEpisodes(kept, _checksum(start, end, steps), over.reaches)
-
-
-def _along(step: Any, rows: Any) -> Any:
-    """Reshape a step of each lane to index the rows of an array [step, ..., lane]."""
-    return step.reshape(-1, *(1,) * (rows.ndim - 2), rows.shape[-1])
+    return _PlayedBlock(over.rows, _checksum(start, over.end, steps), over.reaches)
 
 
 def _checksum(start: TaskState, end: TaskState, steps: Any) -> Any:
@@ -137,5 +155,6 @@ def checksum_of(states: TaskState, steps: Int[np.ndarray, " level"]) -> UInt32[n
 
 
 def repeat_episodes(rows: np.ndarray, steps: Int[np.ndarray, " level"]) -> np.ndarray:
-    """Fill records [256, ..., level] with copies of their first episodes."""
-    return np.take_along_axis(rows, _along(np.arange(RECORD_STEPS)[:, None] % steps, rows), 0)
+    """Fill records [level, 256, ...] with copies of their first episodes, rows [row, ...] one episode after another."""
+    first = np.cumsum(steps) - steps
+    return rows[first[:, None] + np.arange(RECORD_STEPS) % steps[:, None]]

@@ -32,9 +32,10 @@ from levelproof.levelgen.task.actions import (
     discrete_controls,
 )
 from levelproof.levelgen.task.fresh import renewed
-from levelproof.levelgen.task.observe.entities import entities, padded_shape, symbolic_padded
-from levelproof.levelgen.task.observe.flat import LIMIT, feature_count, symbolic_flat
-from levelproof.levelgen.task.observe.pixels import SIDE, pixels
+from levelproof.levelgen.task.observe.entities import padded_shape
+from levelproof.levelgen.task.observe.flat import LIMIT, feature_count
+from levelproof.levelgen.task.observe.kinds import ObservationType, observe
+from levelproof.levelgen.task.observe.pixels import SIDE
 from levelproof.levelgen.task.rules import TaskParams, TaskState
 from levelproof.levelgen.task.spaces import Box, Dict, Discrete, MultiDiscrete, Space
 from levelproof.levelgen.vmapped import single
@@ -50,15 +51,6 @@ class ActionType(StrEnum):
     DISCRETE = "discrete"
     MULTI_DISCRETE = "multi_discrete"
     CONTINUOUS = "continuous"
-
-
-class ObservationType(StrEnum):
-    """How a state is observed (`levelgen.task.observe`)."""
-
-    SYMBOLIC_FLAT = "symbolic_flat"
-    SYMBOLIC_FLAT_PADDED = "symbolic_flat_padded"
-    SYMBOLIC_ENTITY = "symbolic_entity"
-    PIXELS = "pixels"
 
 
 @jax.tree_util.register_dataclass
@@ -107,12 +99,6 @@ CONTROLS: dict[ActionType, Callable[[Level, Array], Controls]] = {
     ActionType.DISCRETE: discrete_controls,
     ActionType.MULTI_DISCRETE: controls,
     ActionType.CONTINUOUS: continuous_controls,
-}
-OBSERVE: dict[ObservationType, Callable[..., Any]] = {
-    ObservationType.SYMBOLIC_FLAT: symbolic_flat,
-    ObservationType.SYMBOLIC_FLAT_PADDED: symbolic_padded,
-    ObservationType.SYMBOLIC_ENTITY: entities,
-    ObservationType.PIXELS: jax.vmap(pixels, -1, -1),
 }
 
 
@@ -308,7 +294,7 @@ class Environment:
         return self._observe(after), after, result.reward, result.done, info
 
     def _observe(self, state: EnvState) -> Any:
-        return OBSERVE[self.observation_type](state.level, state.level.state)
+        return observe(self.observation_type, state.level, state.level.state)
 
 
 def _detached(*inputs: Any) -> Any:

@@ -15,9 +15,9 @@ from jaxtyping import Array, Bool, Float, Int
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.sampling.sampler import Sampler
 from levelproof.levelgen.task import rules as task
-from levelproof.levelgen.task.environment import CONTROLS, OBSERVE, Environment, EnvParams, ObservationType
+from levelproof.levelgen.task.environment import CONTROLS, Environment, EnvParams
 from levelproof.levelgen.task.fresh import renewed
-from levelproof.levelgen.task.observe.flat import level_features, symbolic_flat
+from levelproof.levelgen.task.observe.kinds import constant_features, observe
 from levelproof.levelgen.task.rules import TaskState
 
 
@@ -60,8 +60,7 @@ class Lanes:
         return levels if isinstance(levels, Sampler) else self._table(levels)
 
     def _table(self, level: Level) -> LevelTable:
-        flat = self.env.observation_type == ObservationType.SYMBOLIC_FLAT
-        features = level_features(level) if flat else jnp.zeros((0, len(level)))
+        features = constant_features(self.env.observation_type, level)
         return LevelTable(_constant(level), task.reset(level), features)
 
     def take(self, table: Table, level_index: Int[Array, " lane"]) -> LevelTable:
@@ -110,10 +109,7 @@ class Lanes:
 
     def observe(self, state: LaneState, played: LevelTable) -> Any:
         """Return the observation of each lane, lanes last."""
-        if self.env.observation_type == ObservationType.SYMBOLIC_FLAT:
-            return symbolic_flat(played.level, state.now.state, played.features)
-        world = state.now.state
-        return OBSERVE[self.env.observation_type](replace(played.level, state=world), world)
+        return observe(self.env.observation_type, played.level, state.now.state, played.features)
 
     def _started(
         self, table: Table, played: LevelTable, state: LaneState, done: Bool[Array, " lane"]

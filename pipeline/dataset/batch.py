@@ -2,15 +2,18 @@
 
 import difflib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.witness.witness import Record
 from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.environment import EnvState
 from levelproof.physics.types import Size, State
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.store.contents import table_for
@@ -94,3 +97,37 @@ def expand_fields(fields: Iterable[str], size: Size) -> list[str]:
             raise UserError(f"There is no field {prefix!r}{hint}: levelproof.Record and levelproof.Level list them.")
         chosen += matches
     return list(dict.fromkeys(chosen))
+
+
+def require_steps(steps: np.ndarray) -> None:
+    """Raise UserError unless all of these are steps of a record."""
+    if ((steps < 0) | (steps >= RECORD_STEPS)).any():
+        raise UserError(f"There are no steps {steps.tolist()} in a record: use steps from 0 to {RECORD_STEPS - 1}.")
+
+
+def timed_out(
+    done: Bool[np.ndarray, "item time"], goal: Bool[np.ndarray, "item time"], limit: int
+) -> Bool[np.ndarray, "item time"]:
+    """Return at which steps of whole records the time limit (env steps) ended an episode short of its goal."""
+    steps = np.arange(done.shape[1])
+    starts = np.where(done, steps + 1, 0)[:, :-1]  # first step of the episode after each end
+    start = np.maximum.accumulate(np.pad(starts, [(0, 0), (1, 0)]), 1)
+    return done & ~goal & (steps - start + 1 >= limit)
+
+
+def state_in(
+    arrays: dict[str, np.ndarray], indices: Int[np.ndarray, "*items"], steps: Int[np.ndarray, "*items"]
+) -> EnvState:
+    """Return environment states as jax arrays, one for each item; their `level_index` is the item's index.
+
+    Args:
+        arrays: of levels and their whole records by field name, one of each per item, flat.
+        indices: of trajectories.
+        steps: env steps within the records.
+    """
+    rows = np.arange(indices.size)
+    now = {name: x[rows, steps.ravel()] for name, x in arrays.items() if name.startswith("record/")}
+    level = replace(tree_of(Level, arrays, "level/"), state=tree_of(State, now, "record/state/"))
+    counts = indices.ravel().astype(np.int32), np.zeros(indices.size, np.int32)
+    parts = level, now["record/timestep"], now["record/last_distance"], *counts
+    return EnvState(*jax.tree.map(lambda x: jnp.asarray(x.reshape((*indices.shape, *x.shape[1:]))), parts))

@@ -2,31 +2,42 @@
 
 import weakref
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from typing import Any, Generic, TypeVar
 
-from levelproof.pipeline.dataset.batch import Batch
+from levelproof.pipeline.dataset.order import EpochOrder
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.runtime import own_cores
 
 RENAMED = {"batch": "batch_size", "part": "subset"}  # old names in states saved by the previous version
+T = TypeVar("T")
 
 
-class Batches(Iterator[Batch]):
-    """Iterator over batches, from `Dataset.batches`. Its threads stop when it is exhausted, closed or collected."""
+class Batches(Iterator[T], Generic[T]):
+    """Iterator over batches, from `Dataset.batches` and `Dataset.episode_batches`.
+
+    Its threads stop when it is exhausted, closed or collected.
+    """
 
     def __init__(
-        self, load: Callable[[int], Batch], count: int | None, settings: Mapping[str, Any], prefetch: int, start: Any
+        self,
+        load: Callable[[range], Sequence[T]],
+        count: int | None,
+        settings: Mapping[str, Any],
+        prefetch: int,
+        start: Any,
+        together: int = 1,
     ) -> None:
         """Start iterating, and prefetching.
 
         Args:
-            load: returns the batch at a position; called in threads.
+            load: returns the batches at consecutive positions; called in threads.
             count: number of batches; None: endless.
             settings: arguments that determine the sequence of batches, as JSON.
             prefetch: number of batches to read ahead.
             start: a result of `state` to resume from; None: the first batch.
+            together: number of batches that one call of `load` returns.
 
         Raises:
             UserError: `start` is invalid, or was saved with other settings.
@@ -34,23 +45,27 @@ class Batches(Iterator[Batch]):
         self._load, self._count, self._settings = load, count, dict(settings)
         self._position = 0 if start is None else _position_in(start, self._settings)
         self._pool = ThreadPoolExecutor(len(own_cores()), "levelproof-reader")
-        self._ahead: deque[Future[Batch]] = deque()
-        self._max_ahead = max(prefetch, 0) + 1
+        self._together, self._next = together, self._position  # the position that is loaded next
+        self._loaded: deque[T] = deque()
+        self._ahead: deque[Future[Sequence[T]]] = deque()
+        self._max_ahead = -(-(max(prefetch, 0) + 1) // together)
         self._end = weakref.finalize(self, self._pool.shutdown, wait=False, cancel_futures=True)
 
-    def __next__(self) -> Batch:
-        while self._end.alive and len(self._ahead) < self._max_ahead and self._has(self._position + len(self._ahead)):
-            self._ahead.append(self._pool.submit(self._load, self._position + len(self._ahead)))
-        if not self._ahead:
-            self.close()
-            raise StopIteration
-        try:
-            batch = self._ahead.popleft().result()
-        except BaseException:
-            self.close()
-            raise
+    def __next__(self) -> T:
+        while self._end.alive and len(self._ahead) < self._max_ahead and (some := self._positions()):
+            self._ahead.append(self._pool.submit(self._load, some))
+            self._next = some.stop
+        if not self._loaded:
+            if not self._ahead:
+                self.close()
+                raise StopIteration
+            try:
+                self._loaded.extend(self._ahead.popleft().result())
+            except BaseException:
+                self.close()
+                raise
         self._position += 1
-        return batch
+        return self._loaded.popleft()
 
     def state(self) -> dict[str, Any]:
         """Return the position as JSON values: `batches(..., start=state)` resumes with the batch that would be next."""
@@ -59,10 +74,29 @@ class Batches(Iterator[Batch]):
     def close(self) -> None:
         """Stop prefetching and end the iteration."""
         self._ahead.clear()
+        self._loaded.clear()
         self._end()
 
-    def _has(self, position: int) -> bool:
-        return self._count is None or position < self._count
+    def _positions(self) -> range:
+        """Return the positions to load next; none at the end."""
+        stop = self._next + self._together
+        return range(self._next, stop if self._count is None else min(stop, self._count))
+
+
+def batches_of(
+    load: Callable[[range], Sequence[T]],
+    order: EpochOrder,
+    settings: dict[str, Any],
+    epochs: int | None,
+    prefetch: int | None,
+    start: Any,
+    together: int = 1,
+) -> Batches[T]:
+    """Iterate over the batches of epochs in an order. Other arguments as `Batches`; `prefetch` None: two per core."""
+    settings |= {"batch_size": order.batch_size, "seed": order.seed, "process_count": order.process_count}
+    count = None if epochs is None else epochs * order.batches
+    ahead = 2 * together * len(own_cores()) if prefetch is None else prefetch
+    return Batches(load, count, settings, ahead, start, together)
 
 
 def _position_in(start: Any, settings: Mapping[str, Any]) -> int:

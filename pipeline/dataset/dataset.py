@@ -2,29 +2,29 @@
 
 import hashlib
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from jaxtyping import Bool, Int
+from jaxtyping import Int
 from numpy.typing import ArrayLike
 
-from levelproof.experts.config import RECORD_STEPS
 from levelproof.levelgen.level import Level, size_of
 from levelproof.levelgen.task.actions import action_mask
-from levelproof.levelgen.task.environment import EnvState, ObservationType
+from levelproof.levelgen.task.environment import EnvState
+from levelproof.levelgen.task.observe.kinds import ObservationType
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.types import Size, State
-from levelproof.pipeline.dataset.batch import Batch, expand_fields
-from levelproof.pipeline.dataset.batches import Batches
+from levelproof.pipeline.dataset.batch import Batch, expand_fields, require_steps, state_in, timed_out
+from levelproof.pipeline.dataset.batches import Batches, batches_of
+from levelproof.pipeline.dataset.episodes import EpisodeBatch, gather_episodes
 from levelproof.pipeline.dataset.observations import observe, parse_observation
 from levelproof.pipeline.dataset.order import EpochOrder
 from levelproof.pipeline.dataset.renamed import renamed
@@ -35,7 +35,6 @@ from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.read.levels import rules_of
 from levelproof.pipeline.read.rows import COLUMNS, current_rows, gather_rows, same_positions
 from levelproof.pipeline.read.select import columns_in, select
-from levelproof.pipeline.runtime import own_cores
 from levelproof.pipeline.store.columns import schema_of
 from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.manifest import require_manifest
@@ -44,7 +43,9 @@ from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.words import many
 
 ALWAYS_COLUMNS = ("label", "steps_to_goal", *COLUMNS)
+EPISODES_AT_ONCE = 1024  # read together for batches of episodes: many lanes of similar length side by side
 OPEN_SHARDS = 256  # shards whose indices are cached
+T = TypeVar("T")
 ALWAYS_FIELDS = ("record/action", "record/reward", "record/done", "record/goal")
 
 
@@ -57,19 +58,13 @@ def open(
     goal. Reads the manifest now, trajectories on demand.
 
     Args:
-        path: path of the split, such as `data/1M/s`, or its URL (docs/remote.md); or of a seed file or a folder of
-            some (docs/seeds.md).
-        where: SQL condition on the manifest's columns that selects trajectories, such as `label = 'solved' AND
-            steps_to_goal < 64`; None: all.
+        path: path or URL of the split, such as `data/1M/s`, or of a seed file or a folder of some (docs/seeds.md).
+        where: SQL condition on the manifest's columns, such as `label = 'solved' AND steps_to_goal < 64`; None: all.
         columns: manifest columns to include in `Dataset.manifest`, besides those that are always read.
         validation: share of all levels, 0 to 1, that belongs to `subset="validation"`.
 
-    Returns:
-        The trajectories, as a `Dataset`.
-
     Raises:
-        UserError: the split does not exist, no trajectory meets the condition, or the condition, a column or the share
-            is invalid.
+        UserError: the split does not exist, no trajectory meets the condition, or an argument is invalid.
         Failure: the manifest is damaged, or was written by another version.
     """
     return Dataset(Path(path), where, columns, validation)
@@ -125,8 +120,6 @@ class Dataset:
     def __getitem__(self, index: int) -> Batch:
         """Read one trajectory, arrays [256, ...], with all fields and the observation `symbolic_flat`.
 
-        Negative indices count from the end.
-
         Raises:
             IndexError: the trajectory does not exist.
             Failure: its data is damaged.
@@ -161,11 +154,11 @@ class Dataset:
         windows, kind, chosen = Windows.of(length), parse_observation(observation), expand_fields(fields, self.size)
         indices = np.atleast_1d(np.asarray(indices, np.int64))
         starts = np.broadcast_to(np.asarray(first, np.int64), indices.shape)
-        _require_steps(starts)
+        require_steps(starts)
         needed = [*chosen, *ALWAYS_FIELDS, *expand_fields(["level", *(["record/state"] if kind else [])], self.size)]
         whole = self._arrays(indices, needed)
-        timed_out = _timed_out(whole["record/done"], whole["record/goal"], self.rules.max_timesteps)
-        arrays = windows.cut(whole | {"record/truncated": timed_out}, starts)
+        late = timed_out(whole["record/done"], whole["record/goal"], self.rules.max_timesteps)
+        arrays = windows.cut(whole | {"record/truncated": late}, starts)
         level, mask = tree_of(Level, arrays, "level/"), windows.mask(starts)
         effective = action_mask(jax.tree.map(lambda x: np.moveaxis(x, 0, -1), level)).T[:, None]
         return Batch(
@@ -197,7 +190,7 @@ class Dataset:
         process_count: int = 1,
         prefetch: int | None = None,
         start: dict[str, Any] | None = None,
-    ) -> Batches:
+    ) -> Batches[Batch]:
         """Iterate over batches of trajectories, or of all their windows, which threads prefetch.
 
         Each trajectory or window occurs once per epoch. Padding, with `mask` False, fills the last batch, so that all
@@ -208,11 +201,9 @@ class Dataset:
             seed: seed of the shuffling, which differs between epochs; None: sorted by level id and step.
             subset: `train` or `validation`, split by content hash; None: both.
             length: steps per window, 1 to 256; None: whole records.
-            fields: as in `read`.
-            observation: as in `read`.
+            fields, observation: as in `read`.
             epochs: number of epochs; None: endless.
-            process_index: index of this host, 0 to `process_count` - 1.
-            process_count: number of hosts that share the batches; all pass the same arguments except `process_index`.
+            process_index, process_count: this host's index, and the number of hosts, which share the batches.
             prefetch: number of batches to read ahead; None: two per core.
             start: a result of `Batches.state`, from any host, to resume from; None: the first batch.
 
@@ -220,7 +211,7 @@ class Dataset:
             UserError: an argument is invalid, or the subset is empty.
             Failure: from the iterator, if the data is damaged.
         """
-        windows, indices, fields = Windows.of(length), self._subset(subset), tuple(expand_fields(fields, self.size))
+        windows, indices, fields = Windows.of(length), self._subset(subset), expand_fields(fields, self.size)
         parse_observation(observation)
         order = EpochOrder(len(indices) * windows.per_record, batch_size, seed, process_index, process_count)
 
@@ -230,10 +221,66 @@ class Dataset:
             batch = self.read(indices[which], length, first, fields, observation)
             return replace(batch, mask=batch.mask & new[:, None])
 
-        settings = {"trajectories": self.fingerprint, "subset": subset, "validation": self._opened_with[-1]}
-        settings |= {"length": length, "batch_size": batch_size, "seed": seed, "process_count": process_count}
-        count = None if epochs is None else epochs * order.batches
-        return Batches(load, count, settings, 2 * len(own_cores()) if prefetch is None else prefetch, start)
+        settings = {"trajectories": self.fingerprint, "validation": self._opened_with[-1]} | {
+            "subset": subset,
+            "length": length,
+        }
+        return batches_of(lambda positions: [*map(load, positions)], order, settings, epochs, prefetch, start)
+
+    def episodes(
+        self,
+        indices: ArrayLike,
+        fields: Iterable[str] = (),
+        observation: str | None = ObservationType.SYMBOLIC_FLAT,
+    ) -> EpisodeBatch:
+        """Read the first episodes of trajectories: env steps as rows, one episode after another.
+
+        What a record has after its first episode repeats it, in seeds, or is another success in the same level. Of
+        seeds, only first episodes are simulated, side by side: the more at once, the faster.
+
+        Args:
+            indices: integer indices of trajectories [episode], in any order, with repetitions; a scalar counts as [1].
+            fields, observation: as in `read`.
+
+        Raises:
+            UserError: an index, field or observation type does not exist.
+            Failure: the data is damaged.
+        """
+        kind, chosen = parse_observation(observation), expand_fields(fields, self.size)
+        gather = lambda rows: gather_episodes(self.split, rows, chosen, kind, self._shard)
+        return self._gathered(np.atleast_1d(np.asarray(indices, np.int64)), gather)
+
+    def episode_batches(
+        self,
+        batch_size: int,
+        seed: int | None = None,
+        subset: str | None = None,
+        fields: Iterable[str] = (),
+        observation: str | None = ObservationType.SYMBOLIC_FLAT,
+        epochs: int | None = 1,
+        process_index: int = 0,
+        process_count: int = 1,
+        prefetch: int | None = None,
+        start: dict[str, Any] | None = None,
+    ) -> Batches[EpisodeBatch]:
+        """Iterate over batches of first episodes, which threads prefetch, many batches at once.
+
+        Takes the arguments of `batches`, and raises what it raises. `mask` is False in padding.
+        """
+        indices, fields, _ = self._subset(subset), expand_fields(fields, self.size), parse_observation(observation)
+        order = EpochOrder(len(indices), batch_size, seed, process_index, process_count)
+
+        def load(positions: range) -> list[EpisodeBatch]:
+            items, new = map(np.concatenate, zip(*map(order.items, positions), strict=True))
+            read = self.episodes(indices[items], fields, observation)
+            return replace(read, mask=new[read.episode]).parts(batch_size)
+
+        together = max(1, EPISODES_AT_ONCE // batch_size)
+        settings = {"trajectories": self.fingerprint, "validation": self._opened_with[-1]} | {
+            "subset": subset,
+            "episodes": "first",
+        }
+        return batches_of(load, order, settings, epochs, prefetch, start, together)
 
     @renamed(part="subset")
     def grain(
@@ -274,8 +321,7 @@ class Dataset:
     def state(self, index: ArrayLike, step: ArrayLike = 0) -> EnvState:
         """Return the environment's state before a step of a trajectory, as jax arrays; its `level_index` is the index.
 
-        Playing the stored actions from there by `rules` reproduces the stored steps, bit for bit on the versions and
-        device that made them.
+        Playing the stored actions from there by `rules` reproduces the stored steps, bit for bit.
 
         Args:
             index: integer index of a trajectory, or an array of indices, whose axes come first in the state.
@@ -286,20 +332,18 @@ class Dataset:
             Failure: the data is damaged.
         """
         indices, steps = np.broadcast_arrays(np.asarray(index, np.int64), np.asarray(step, np.int64))
-        _require_steps(steps)
+        require_steps(steps)
         fields = expand_fields(["level", "record/state", "record/timestep", "record/last_distance"], self.size)
-        arrays = self._arrays(indices.ravel(), fields)
-        rows = np.arange(indices.size)
-        arrays |= {name: x[rows, steps.ravel()] for name, x in arrays.items() if name.startswith("record/")}
-        level = replace(tree_of(Level, arrays, "level/"), state=tree_of(State, arrays, "record/state/"))
-        counts = indices.ravel().astype(np.int32), np.zeros(indices.size, np.int32)
-        parts = level, arrays["record/timestep"], arrays["record/last_distance"], *counts
-        return EnvState(*jax.tree.map(lambda x: jnp.asarray(x.reshape((*indices.shape, *x.shape[1:]))), parts))
+        return state_in(self._arrays(indices.ravel(), fields), indices, steps)
 
     @cached_property
     def fingerprint(self) -> str:
         """Hash of the level ids: equal for equal selections of trajectories."""
         return hashlib.sha256(self._manifest["level_id"].to_numpy().tobytes()).hexdigest()[:16]
+
+    @property
+    def _sources(self) -> dict[str, Any]:
+        return {"trajectories": self.fingerprint, "validation": self._opened_with[-1]}
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the arguments of `open`: unpickling rereads the manifest."""
@@ -319,13 +363,17 @@ class Dataset:
         return indices
 
     def _arrays(self, indices: Int[np.ndarray, " batch"], fields: Sequence[str]) -> dict[str, np.ndarray]:
-        """Gather arrays of trajectories by field name, level axis first; follow levels that a seal moved."""
+        """Gather arrays of trajectories by field name, level axis first."""
+        return self._gathered(indices, lambda rows: gather_rows(self.split, rows, fields, self._shard))
+
+    def _gathered(self, indices: Int[np.ndarray, " batch"], gather: Callable[[pa.Table], T]) -> T:
+        """Return what `gather` reads of these manifest rows; follow levels that a seal moved."""
         if not indices.size or indices.min() < 0 or indices.max() >= len(self):
             raise UserError(f"There are no trajectories {indices.tolist()}: use indices from 0 to {len(self) - 1}.")
         while True:
             manifest = self._manifest
             try:
-                return gather_rows(self.split, manifest.select(COLUMNS).take(pa.array(indices)), fields, self._shard)
+                return gather(manifest.select(COLUMNS).take(pa.array(indices)))
             except Failure:
                 if not self._relocate(manifest):
                     raise
@@ -342,21 +390,6 @@ class Dataset:
                 manifest = manifest.set_column(at, name, current[name].combine_chunks())
             self._manifest = manifest
             return not same
-
-
-def _require_steps(steps: np.ndarray) -> None:
-    if ((steps < 0) | (steps >= RECORD_STEPS)).any():
-        raise UserError(f"There are no steps {steps.tolist()} in a record: use steps from 0 to {RECORD_STEPS - 1}.")
-
-
-def _timed_out(
-    done: Bool[np.ndarray, "item time"], goal: Bool[np.ndarray, "item time"], limit: int
-) -> Bool[np.ndarray, "item time"]:
-    """Return at which steps of whole records the time limit (env steps) ended an episode short of its goal."""
-    steps = np.arange(done.shape[1])
-    starts = np.where(done, steps + 1, 0)[:, :-1]  # first step of the episode after each end
-    start = np.maximum.accumulate(np.pad(starts, [(0, 0), (1, 0)]), 1)
-    return done & ~goal & (steps - start + 1 >= limit)
 
 
 def _reopen(opened_with: tuple, fingerprint: str) -> Dataset:

@@ -10,7 +10,8 @@ from levelproof.levelgen.level import Level
 from levelproof.levelgen.sampling.distribution import Distribution
 from levelproof.levelgen.sampling.sampler import Sampler, sampler
 from levelproof.levelgen.task import environment
-from levelproof.levelgen.task.environment import ActionType, Environment, EnvParams, ObservationType
+from levelproof.levelgen.task.environment import ActionType, Environment, EnvParams
+from levelproof.levelgen.task.observe.kinds import ObservationType
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 from levelproof.physics.types import Size
 from levelproof.pipeline.errors import UserError

@@ -1,19 +1,23 @@
 """Observations of stored states, computed on JAX's default device."""
 
-from dataclasses import replace
 from functools import partial
 from threading import Lock
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
 
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.task.environment import OBSERVE, ObservationType
+from levelproof.levelgen.task.observe.kinds import ObservationType, constant_features
+from levelproof.levelgen.task.observe.kinds import observe as observe_lanes
 from levelproof.physics.types import State
 from levelproof.pipeline.errors import UserError
 
+MIN_ROWS = 1024
 COMPILING = Lock()  # or threads that need the same new program would each compile it
+T = TypeVar("T")
 
 
 def parse_observation(name: str | None) -> ObservationType | None:
@@ -31,8 +35,31 @@ def observe(kind: ObservationType, level: Level, states: State) -> Any:
         return _observe(kind, level, states)
 
 
+def observe_rows(kind: ObservationType, level: Level, row_level: Int[np.ndarray, " row"], states: State) -> Any:
+    """Observe states [row, ...], each in its level of several [level, ...]; return numpy arrays [row, ...]."""
+    count = len(row_level)
+    padded = max(MIN_ROWS, 1 << (count - 1).bit_length())  # few shapes: a program serves one
+    row_level, states = jax.tree.map(lambda x: np.resize(x, (padded, *x.shape[1:])), (row_level, states))
+    with COMPILING:
+        shown = jax.device_get(_observe_rows(kind, level, row_level, states))
+    return jax.tree.map(lambda x: x[:count], shown)
+
+
 @partial(jax.jit, static_argnames="kind")
 def _observe(kind: ObservationType, level: Level, states: State) -> Any:
-    level, states = jax.tree.map(lambda x: jnp.moveaxis(jnp.asarray(x), 0, -1), (level, states))
-    shown = jax.vmap(lambda state: OBSERVE[kind](replace(level, state=state), state))(states)
+    level, states = _lanes_last((level, states))
+    shown = jax.vmap(lambda state: observe_lanes(kind, level, state))(states)
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), shown)
+
+
+@partial(jax.jit, static_argnames="kind")
+def _observe_rows(kind: ObservationType, level: Level, row_level: Any, states: State) -> Any:
+    level, states = _lanes_last((level, states))
+    own = lambda x: x[..., row_level]
+    constant = own(constant_features(kind, level))
+    shown = observe_lanes(kind, jax.tree.map(own, level), states, constant)
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), shown)
+
+
+def _lanes_last(tree: T) -> T:
+    return jax.tree.map(lambda x: jnp.moveaxis(jnp.asarray(x), 0, -1), tree)

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from levelproof.levelgen.task.environment import ObservationType
+from levelproof.levelgen.task.observe.kinds import ObservationType
 from levelproof.pipeline.dataset.batch import Batch
 from levelproof.pipeline.dataset.windows import Windows
 from levelproof.pipeline.errors import UserError

@@ -218,13 +218,13 @@ def read_together(
     places = _one_after_another(parts) if places is None else places
     if len(by_encoding) == 1:
         group = parts[0][0].restore(parts, table, places)
-        _report(parts, places, group.unlike, exactly)
+        report_unlike(parts, places, group.unlike, exactly)
         return group.arrays
     groups = []
     for alike in by_encoding.values():
         members = [parts[i] for i in alike]
         groups.append(members[0][0].restore(members, table, _one_after_another(members)))
-        _report(members, _one_after_another(members), groups[-1].unlike, exactly)
+        report_unlike(members, _one_after_another(members), groups[-1].unlike, exactly)
     back = np.argsort(np.concatenate([places[i] for alike in by_encoding.values() for i in alike]))
     return {name: np.concatenate([group.arrays[name] for group in groups])[back] for name in groups[0].arrays}
 
@@ -262,7 +262,7 @@ def _one_after_another(parts: Sequence[Part]) -> list[range]:
     return [range(end - len(rows), end) for end, (_, rows) in zip(ends, parts, strict=True)]
 
 
-def _report(parts: Sequence[Part], places: Sequence[Sequence[int]], unlike: np.ndarray, refuse: bool) -> None:
+def report_unlike(parts: Sequence[Part], places: Sequence[Sequence[int]], unlike: np.ndarray, refuse: bool) -> None:
     """Warn, or with `refuse` fail, if this machine's states differ from the stored ones."""
     for (shard, rows), mine in zip(parts, places, strict=True) if (unlike >= 0).any() else ():
         unlike_here = unlike[np.asarray(mine, int)]

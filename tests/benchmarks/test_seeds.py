@@ -21,4 +21,5 @@ def test_bytes_add_up_and_every_way_reads(tmp_path: Path) -> None:
     assert sum(stored["columns"].values()) == stored["bytes"] == seeds.stat().st_size
     labels = require_manifest(split, ["label"]).table["label"].to_pylist()
     assert (stored["levels"], stored["solved"]) == (len(labels), labels.count("solved"))
-    assert min(rates[name]["transitions"] for name in ("seeds", "full", "Lanes")) > 0
+    kinds = [f"{name}, {what}" for name in ("seeds", "full") for what in ("records", "first episodes")]
+    assert min(rates[name]["transitions"] for name in (*kinds, "Lanes")) > 0

@@ -3,14 +3,16 @@
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 import pyarrow as pa
+from jaxtyping import Bool, Int
 
 from levelproof.experts.witness.episode import play_episodes, repeat_episodes
-from levelproof.experts.witness.resume import timesteps
-from levelproof.levelgen.level import Level, concatenate_levels, name_of
+from levelproof.levelgen.level import Level, name_of
+from levelproof.levelgen.task.observe.kinds import ObservationType
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.density import Restored
 from levelproof.pipeline.store.fields import arrays_of
@@ -21,7 +23,17 @@ from levelproof.pipeline.store.seed.source import LevelSource
 from levelproof.pipeline.store.shard import Part, Shard
 
 COLUMNS = ("label", "steps_to_goal", "witness", "checksum")
-TIME = "record/timestep"
+RECORD = "record/"
+
+
+class SeedEpisodes(NamedTuple):
+    """First episodes of levels, whose env steps are the rows of arrays, one episode after another."""
+
+    level: dict[str, np.ndarray]  # fields of levels, [level, ...]
+    steps: Int[np.ndarray, " level"]
+    rows: dict[str, np.ndarray]  # fields of records, [row, ...]
+    observation: Any  # of the state before each action, [row, ...]; None if not requested
+    wrong: Bool[np.ndarray, " level"]  # whether the engine here plays another episode than the one that was stored
 
 
 class SeedShard(Shard):
@@ -82,14 +94,16 @@ class SeedShard(Shard):
     def restore(self, parts: Sequence[Part], table: Sequence[FieldSpec], places: Sequence[Sequence[int]]) -> Restored:
         """Simulate rows of seed files. Raises as `Shard.restore`."""
         seeds: Any = parts
-        try:
-            simulated = simulate(seeds, table)
-        except ValueError as error:
-            raise damaged_seed(self.path, error) from error
-        back = np.argsort(np.concatenate([np.asarray(mine, int) for mine in places]))
-        return Restored(
-            {name: np.moveaxis(x, -1, 0)[back] for name, x in simulated.arrays.items()}, simulated.unlike[back]
-        )
+        names = [field.name for field in table]
+        if not any(name.startswith(RECORD) for name in names):
+            level = _levels(seeds, places)
+            return Restored(_of_levels(level, names), np.full(len(level), -1))
+        made = play_seeds(seeds, places, names)
+        arrays = made.level | {name: repeat_episodes(x, made.steps) for name, x in made.rows.items()}
+        return Restored({name: arrays[name] for name in names}, np.where(made.wrong, 0, -1))
+
+
+SeedPart = tuple[SeedShard, Sequence[int]]
 
 
 def stored_levels(source: Path, level_ids: np.ndarray) -> Level:
@@ -110,24 +124,56 @@ def stored_levels(source: Path, level_ids: np.ndarray) -> Level:
         raise damaged_seed(path, error) from error
 
 
-def simulate(parts: Sequence[tuple[SeedShard, Sequence[int]]], table: Sequence[FieldSpec]) -> Restored:
-    """Make fields of the rows of seed files of one size and one set of rules; level axis last, rows in order.
+def play_seeds(
+    parts: Sequence[SeedPart],
+    places: Sequence[Sequence[int]],
+    names: Sequence[str],
+    observation: ObservationType | None = None,
+) -> SeedEpisodes:
+    """Simulate the first episodes of rows of seed files of one size and one set of rules.
+
+    Args:
+        parts: seed files, and rows of each.
+        places: positions of each part's rows in the result.
+        names: fields of the shard to return.
+        observation: type of the observation to return; None: none.
 
     Raises:
-        ValueError: a row is invalid.
+        Failure: a row is invalid.
     """
-    names = [field.name for field in table]
-    level = concatenate_levels([shard.levels(rows) for shard, rows in parts])
-    arrays = {name: x for name, x in arrays_of(level, "level/").items() if name in names}
-    if all(name in arrays for name in names):
-        return Restored({name: arrays[name] for name in names}, np.full(len(level), -1))
-    join = lambda name: np.concatenate([getattr(shard, name)[np.asarray(rows)] for shard, rows in parts])
-    action = np.concatenate([shard.actions(rows) for shard, rows in parts], -1)
-    steps, checksum = join("steps"), join("checksum")
-    wanted = frozenset(name.removeprefix("record/") for name in names if name.startswith("record/"))
-    made = play_episodes(level, action, steps, parts[0][0].encoding.rules, wanted)
-    whole = {f"record/{name}": repeat_episodes(x, steps) for name, x in made.fields.items()}
-    if TIME in names:
-        whole[TIME] = timesteps(np.arange(1, len(action) + 1)[:, None] % steps == 0)
+    joined = lambda arrays: _arranged(arrays, places)
+    level = _levels(parts, places)
+    steps, checksum = (
+        joined([getattr(shard, name)[np.asarray(rows)] for shard, rows in parts]) for name in ("steps", "checksum")
+    )
+    try:
+        action = joined([shard.actions(rows) for shard, rows in parts])
+    except ValueError as error:
+        raise damaged_seed(parts[0][0].path, error) from error
+    wanted = frozenset(name.removeprefix(RECORD) for name in names if name.startswith(RECORD))
+    made = play_episodes(level, action, steps, parts[0][0].encoding.rules, wanted, observation)
+    rows = {f"{RECORD}{name}": x for name, x in made.fields.items()}
     wrong = ~made.reaches | (made.checksum != checksum)
-    return Restored({name: (arrays | whole)[name] for name in names}, np.where(wrong, 0, -1))
+    return SeedEpisodes(_of_levels(level, names), steps, rows, made.observation, wrong)
+
+
+def _levels(parts: Sequence[SeedPart], places: Sequence[Sequence[int]]) -> Level:
+    """Make the levels of rows, level axis last."""
+    try:
+        each = [shard.levels(rows) for shard, rows in parts]
+    except ValueError as error:
+        raise damaged_seed(parts[0][0].path, error) from error
+    return jax.tree.map(lambda *xs: _arranged(xs, places), *each)
+
+
+def _arranged(arrays: Sequence[np.ndarray], places: Sequence[Sequence[int]]) -> np.ndarray:
+    """Join the arrays of several parts, level axis last, in the order of their positions in the result."""
+    order = np.argsort(np.concatenate([np.asarray(mine, int) for mine in places]))
+    if (order[1:] > order[:-1]).all():  # as of a single file, whose large arrays need no copy
+        return np.concatenate(arrays, -1) if len(arrays) > 1 else arrays[0]
+    return np.concatenate(arrays, -1)[..., order]
+
+
+def _of_levels(level: Level, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Return the named arrays of levels, level axis first."""
+    return {name: np.moveaxis(x, -1, 0) for name, x in arrays_of(level, "level/").items() if name in names}

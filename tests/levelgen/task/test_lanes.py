@@ -9,8 +9,9 @@ from levelproof.levelgen.level import Level
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import CHOICES
-from levelproof.levelgen.task.environment import ObservationType, make, starts
+from levelproof.levelgen.task.environment import make, starts
 from levelproof.levelgen.task.lanes import Lanes
+from levelproof.levelgen.task.observe.kinds import ObservationType
 
 COUNT, STEPS = 24, 12
 

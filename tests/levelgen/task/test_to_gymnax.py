@@ -9,7 +9,8 @@ import pytest
 
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task import rules as task
-from levelproof.levelgen.task.environment import ActionType, ObservationType, make, starts
+from levelproof.levelgen.task.environment import ActionType, make, starts
+from levelproof.levelgen.task.observe.kinds import ObservationType
 from levelproof.levelgen.task.to_gymnax import to_gymnax
 
 gymnax = pytest.importorskip("gymnax")

@@ -93,12 +93,12 @@ def test_batches_stop_their_threads_when_collected(data: Dataset) -> None:
 def test_batches_read_ahead_exactly_prefetch_batches() -> None:
     requested, go = [], threading.Event()
 
-    def load(position: int):
-        requested.append(position)
+    def load(positions: range) -> range:
+        requested.extend(positions)
         go.wait(patience(10))
-        return position
+        return positions
 
-    batches = Batches(load, None, {}, 3, None)  # type: ignore[arg-type]
+    batches = Batches(load, None, {}, 3, None)
     go.set()
     assert next(batches) == 0
     wait_until(lambda: len(requested) >= 4, 10, requested)

@@ -12,8 +12,10 @@ import pytest
 
 import levelproof
 from levelproof.levelgen.task.actions import action_mask
-from levelproof.levelgen.task.environment import ObservationType, make
-from levelproof.pipeline.dataset.dataset import Dataset, _timed_out, open
+from levelproof.levelgen.task.environment import make
+from levelproof.levelgen.task.observe.kinds import ObservationType
+from levelproof.pipeline.dataset.batch import timed_out
+from levelproof.pipeline.dataset.dataset import Dataset, open
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.store.fields import arrays_of, same_bits
@@ -82,7 +84,7 @@ def test_timed_out_marks_episodes_as_long_as_the_limit() -> None:
     done[0, [3, 7, 10]] = done[1, [1, 5, 11]] = done[2, [3]] = goal[2, 3] = True
     expected = np.zeros((3, 12), bool)
     expected[0, [3, 7]] = expected[1, [5, 11]] = True
-    assert_same(_timed_out(done, goal, 4), expected)
+    assert_same(timed_out(done, goal, 4), expected)
 
 
 def test_old_argument_names_still_work_and_warn(data: Dataset) -> None:
