@@ -201,9 +201,11 @@ class Dataset:
             seed: seed of the shuffling, which differs between epochs; None: sorted by level id and step.
             subset: `train` or `validation`, split by content hash; None: both.
             length: steps per window, 1 to 256; None: whole records.
-            fields, observation: as in `read`.
+            fields: as in `read`.
+            observation: as in `read`.
             epochs: number of epochs; None: endless.
-            process_index, process_count: this host's index, and the number of hosts, which share the batches.
+            process_index: index of this host.
+            process_count: number of hosts that share the batches; all pass the same arguments but `process_index`.
             prefetch: number of batches to read ahead; None: two per core.
             start: a result of `Batches.state`, from any host, to resume from; None: the first batch.
 
@@ -240,7 +242,8 @@ class Dataset:
 
         Args:
             indices: integer indices of trajectories [episode], in any order, with repetitions; a scalar counts as [1].
-            fields, observation: as in `read`.
+            fields: as in `read`.
+            observation: as in `read`.
 
         Raises:
             UserError: an index, field or observation type does not exist.
@@ -340,10 +343,6 @@ class Dataset:
     def fingerprint(self) -> str:
         """Hash of the level ids: equal for equal selections of trajectories."""
         return hashlib.sha256(self._manifest["level_id"].to_numpy().tobytes()).hexdigest()[:16]
-
-    @property
-    def _sources(self) -> dict[str, Any]:
-        return {"trajectories": self.fingerprint, "validation": self._opened_with[-1]}
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the arguments of `open`: unpickling rereads the manifest."""
