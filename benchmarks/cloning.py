@@ -30,6 +30,8 @@ BASELINES = (
     "its own expert, 64k",
     "its own expert, 256k",
 )
+PLOT = "cloning.svg"
+BLUE, GREEN, GREY = "#0072b2", "#009e73", "#777777"
 COLUMNS = {  # of sealed levels: which of them count, who plays, and which of its rates
     "sampled, of all": (ALL, SAMPLED, "once"),
     "sampled, of solved": (SOLVED, SAMPLED, "once"),
@@ -77,7 +79,11 @@ def run(args: argparse.Namespace) -> Report:
         ("baseline", "of all", "of solved", "of solved, best of 8"), others,
         "The same levels, with 95% intervals over levels",
     )  # fmt: skip
-    return Report("Cloning against the number of levels", results, [Table(head, rows, title), second], notes)
+    notes += [f"![Share of levels solved in one attempt, against the number of levels cloned from]({PLOT})"]
+    return Report(
+        "Cloning against the number of levels", results, [Table(head, rows, title), second], notes,
+        plots={PLOT: lambda path: draw(path, results)},
+    )  # fmt: skip
 
 
 def measured(args: argparse.Namespace, last: int, count: int, seed: int) -> dict[str, Any]:
@@ -122,3 +128,33 @@ def range_text(rates: list[float]) -> str:
 def interval_text(rate: dict[str, Any]) -> str:
     low, high = rate["interval"]
     return f"{rate['rate']:.1%} ({low:.1%} to {high:.1%})"
+
+
+def draw(path: Path, results: list[dict[str, Any]]) -> None:
+    """Plot the rates of sampled actions on sealed and on known levels, a point per policy, beside the baselines."""
+    import matplotlib
+
+    matplotlib.use("svg")
+    matplotlib.rcParams.update({"svg.hashsalt": "levelproof", "font.size": 9})
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
+    counts = sorted({each["levels"] for each in results})
+    for where, levels, colour, name in (
+        ("seen", ALL, GREEN, "levels cloned from"),
+        ("sealed", SOLVED, BLUE, "levels never seen"),
+    ):
+        rate = lambda each, where=where, levels=levels: 100 * each[where][levels][SAMPLED]["once"]["rate"]
+        axes.plot([each["levels"] for each in results], [*map(rate, results)], "o", color=colour, markersize=3)
+        means = [np.mean([rate(each) for each in results if each["levels"] == count]) for count in counts]
+        axes.plot(counts, means, color=colour, label=name)
+    for player in BASELINES[1:]:
+        rate = 100 * results[0]["sealed"][SOLVED][player]["once"]["rate"]
+        axes.axhline(rate, color=GREY, linewidth=0.7, linestyle=":")
+        axes.annotate(player, (1, rate), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=7,
+                      color=GREY)  # fmt: skip
+    axes.set(xscale="log", ylim=(0, None), xlabel="solved levels cloned from", ylabel="solved in one attempt, %")
+    axes.legend(frameon=False, loc="upper right")
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, metadata={"Date": None})
+    plt.close(figure)

@@ -20,6 +20,9 @@ def test_cloning_measures_policies_and_keeps_them(tmp_path: Path) -> None:
     first = run(args)
     assert first.tables[0].rows[0][0] == str(solved)
     assert len(first.tables[1].rows) == len(BASELINES)
+    for name, draw in first.plots.items():
+        draw(tmp_path / name)
+        assert (tmp_path / name).read_text().rstrip().endswith("</svg>")
     kept = [tmp_path / f"kept/{solved}-0" / name for name in ("sealed.json", "seen.json")]
     before = [file.stat().st_mtime_ns for file in kept]
     assert run(args).results == first.results
