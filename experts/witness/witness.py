@@ -51,10 +51,15 @@ def replay(level: Level, action: ArrayLike, rules: TaskParams = DEFAULT_RULES) -
         level: levels, level axis last.
         action: int [256, 6, level], multi-discrete: one entry per binding (`levelgen.task.actions`).
         rules: the task's rules.
+
+    Raises:
+        ValueError: there are no levels, or not as many as actions.
     """
     level = jax.tree.map(np.asarray, level)
     actions = np.asarray(action, np.int32)
     count = actions.shape[-1]
+    if not 0 < count == len(level):
+        raise ValueError(f"there are {len(level)} levels and actions for {count}: give at least one, and as many")
     parts = [jax.device_get(replay_block(take(level, lanes), actions[..., lanes], rules)) for lanes in blocks(count)]
     return jax.tree.map(lambda *xs: np.ascontiguousarray(np.concatenate(xs, -1)[..., :count]), *parts)
 

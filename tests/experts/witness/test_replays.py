@@ -6,6 +6,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.witness.witness import replay
+from levelproof.levelgen.level import ACTIONS
+from levelproof.levelgen.sampling.sampler import sample_levels
 from tests.experts.witness.bits import FILE, digests
 from tests.processors import OLD, ROOT, run_on
 
@@ -23,3 +27,9 @@ def test_witnesses_of_the_reference_manifest_give_their_golden_records() -> None
 @pytest.mark.parametrize("processor", OLD)
 def test_witnesses_give_the_same_records_on_other_processors(processor: str) -> None:
     assert json.loads(run_on(processor, "tests.experts.witness.bits")) == WITNESSES["digest"].tolist()
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_replay_refuses_no_levels_and_actions_of_others(count: int) -> None:
+    with pytest.raises(ValueError, match=f"{count} levels and actions for 0"):
+        replay(sample_levels(np.arange(4), "s")[:count], np.zeros((RECORD_STEPS, ACTIONS, 0), int))
