@@ -5,6 +5,7 @@ results do not depend on how levels are batched.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -16,15 +17,16 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.networks.over_levels import NetworkConfig, policy_logits
 from levelproof.experts.policy import most_probable, sample
-from levelproof.levelgen.batching import block_size, blocks, repeat, take
+from levelproof.levelgen.batching import block_size, blocks, take
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import ACTIONS, Level
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import CHOICES, action_mask
-from levelproof.levelgen.task.rules import TaskParams, TaskState
+from levelproof.levelgen.task.fresh import renewed
+from levelproof.levelgen.task.rules import StepResult, TaskParams, TaskState
 
-LANES = 1024  # of a batch
-PART = 16  # env steps between checks whether all attempts have ended
+LANES = 1024  # that play side by side
+QUEUED = 8  # episodes of a batch for each lane; at a batch's end, lanes wait for its last episodes
 STAY = 0.9  # chance that sticky random play repeats an entry of the previous action
 
 
@@ -98,17 +100,19 @@ def play(
         seed: 0 or more.
         rules: the task's rules.
         follow: called after every batch with its number of levels.
-        lanes: episodes of a batch, which bound its memory; they change no result.
+        lanes: episodes that are played side by side, which bound the memory; they change no result.
     """
     rounds = -(-attempts // lanes)  # of each batch; more than 1 if a level has more attempts than `lanes`
     at_once = -(-attempts // rounds)
-    count, program = len(level_ids), _program(player, at_once, rules)
+    count, program = len(level_ids), _program(player, at_once, rules, lanes)
     parts = []
-    for some in blocks(count, block_size(count, max(1, lanes // at_once))):
-        batch, firsts = (take(levels, some), level_ids[some], np.uint32(seed)), np.arange(rounds, dtype=np.uint32)
-        played = [jax.device_get(program(params, *batch, first)) for first in firsts * at_once]
+    for some in blocks(count, block_size(count, max(1, QUEUED * lanes // at_once))):
+        own = np.int32(some[-1] - some[0] + 1)  # without padding
+        batch = take(levels, some), level_ids[some], own, np.uint32(seed)
+        firsts = np.arange(rounds, dtype=np.uint32) * at_once
+        played = [jax.device_get(program(params, *batch, first)) for first in firsts]
         parts.append([np.concatenate(column, 1)[:, :attempts] for column in zip(*played, strict=True)])
-        follow(len(np.unique(some)))
+        follow(int(own))
     return FirstEpisodes(*(np.concatenate(column)[:count] for column in zip(*parts, strict=True)))
 
 
@@ -133,73 +137,91 @@ def _recorder(player: Player, rules: TaskParams) -> Callable[..., Int[Array, "25
 
     @jax.jit
     def run(params: Any, levels: Level, level_ids: Int[Array, " level"], seed: Array) -> Int[Array, "256 6 level"]:
-        keys = _keys(level_ids, seed, jnp.arange(1))
-        step = partial(_step, player, params, levels, action_mask(levels), keys, rules)
-        return jax.lax.scan(step, _begun(levels), jnp.arange(RECORD_STEPS))[1]
+        def act(attempt: _Attempt, _: Any) -> tuple[_Attempt, Int[Array, "6 level"]]:
+            after = _step(player, params, attempt, rules)[0]
+            return after, after.previous
+
+        begun = _begun(levels, _keys(level_ids, seed, jnp.arange(1)))
+        return jax.lax.scan(act, begun, length=RECORD_STEPS)[1]
 
     return run
 
 
-class _Playing(NamedTuple):
+class _Attempt(NamedTuple):
+    """An episode under way in each lane."""
+
+    level: Level  # `state` is None
+    key: Key[Array, " lane"]
     now: TaskState
     previous: Int[Array, "6 lane"]
-    ended: Bool[Array, " lane"]
-    solved: Bool[Array, " lane"]
-    env_steps: Int[Array, " lane"]
+
+
+class _Queue(NamedTuple):
+    """Lanes that take one episode of a batch after another, and the results of those that ended."""
+
+    episode: Int[Array, " lane"]  # number of the lane's episode; as many as there are: none is left for the lane
+    attempt: _Attempt
+    coming: Int[Array, ""]  # number of the episode that starts next
+    solved: Bool[Array, " episode"]
+    env_steps: Int[Array, " episode"]
 
 
 @lru_cache(maxsize=16)
-def _program(player: Player, attempts: int, rules: TaskParams) -> Callable[..., FirstEpisodes]:
-    """Compile the episodes of a batch of levels; `first` is the number of their first attempt."""
+def _program(player: Player, attempts: int, rules: TaskParams, lanes: int) -> Callable[..., FirstEpisodes]:
+    """Compile the episodes of the first `own` levels of a batch; `first` is the number of their first attempt.
+
+    A lane whose episode ends starts the next one of the batch: most episodes are short, and the longest last for
+    RECORD_STEPS.
+    """
 
     @jax.jit
-    def run(params: Any, levels: Level, level_ids: Int[Array, " level"], seed: Array, first: Array) -> FirstEpisodes:
+    def run(
+        params: Any, levels: Level, level_ids: Int[Array, " level"], own: Int[Array, ""], seed: Array, first: Array
+    ) -> FirstEpisodes:
+        room, count = len(level_ids) * attempts, own * attempts
+        keys = _keys(level_ids, seed, first + jnp.arange(attempts))
+        begin = lambda episode: _begun(jax.tree.map(lambda x: x[..., episode // attempts], levels), keys[episode])
+
+        def advance(queue: _Queue) -> _Queue:
+            attempt, result = _step(player, params, queue.attempt, rules)
+            steps = attempt.now.timestep
+            over = (queue.episode < count) & (result.done | (steps == RECORD_STEPS))
+            ended = jnp.where(over, queue.episode, room)  # `room`: dropped
+            rank = jnp.cumsum(over, dtype=jnp.int32)
+            episode = jnp.where(over, jnp.minimum(queue.coming + rank - 1, count), queue.episode)
+            return _Queue(
+                episode,
+                renewed(over & (episode < count), episode, begin, attempt),
+                queue.coming + rank[-1],
+                queue.solved.at[ended].set(result.goal, mode="drop"),
+                queue.env_steps.at[ended].set(steps, mode="drop"),
+            )
+
+        width = min(lanes, room)
+        at_first = jnp.arange(width, dtype=jnp.int32)
+        results = jnp.zeros(room, bool), jnp.zeros(room, jnp.int32)
+        queue = _Queue(at_first, begin(at_first), jnp.int32(width), *results)
+        over = jax.lax.while_loop(lambda queue: (queue.episode < count).any(), advance, queue)
         shape = len(level_ids), attempts
-        keys, level = _keys(level_ids, seed, first + jnp.arange(attempts)), repeat(levels, attempts)
-        step = partial(_step, player, params, level, action_mask(level), keys, rules)
-
-        def advance(carry: tuple[Array, _Playing]) -> tuple[Array, _Playing]:
-            first, playing = carry
-            return first + PART, jax.lax.scan(step, playing, first + jnp.arange(PART))[0]
-
-        going = lambda carry: (carry[0] < RECORD_STEPS) & ~carry[1].ended.all()
-        _, after = jax.lax.while_loop(going, advance, (jnp.int32(0), _begun(level)))
-        return FirstEpisodes(after.solved.reshape(shape), after.env_steps.reshape(shape))  # pyright: ignore
+        return FirstEpisodes(over.solved.reshape(shape), over.env_steps.reshape(shape))  # pyright: ignore
 
     return run
 
 
-def _begun(level: Level) -> _Playing:
-    no = jnp.zeros(len(level), bool)
-    return _Playing(task.reset(level), jnp.zeros((ACTIONS, no.size), jnp.int32), no, no, no.astype(jnp.int32))
+def _begun(level: Level, key: Key[Array, " lane"]) -> _Attempt:
+    now = task.reset(level)
+    constant = replace(level, state=None)  # pyright: ignore[reportArgumentType]
+    return _Attempt(constant, key, now, jnp.zeros((ACTIONS, len(now.timestep)), jnp.int32))
 
 
-def _step(
-    player: Player,
-    params: Any,
-    level: Level,
-    live: Bool[Array, "6 lane"],
-    keys: Key[Array, " lane"],
-    rules: TaskParams,
-    playing: _Playing,
-    number: Int[Array, ""],
-) -> tuple[_Playing, Int[Array, "6 lane"]]:
-    """Take env step `number` in every lane; lanes that have ended continue, but no longer count.
-
-    Returns the next state of play, and the actions.
-    """
-    draw = lambda key: jax.random.uniform(jax.random.fold_in(key, number), (ACTIONS,))
-    moment = Moment(level, playing.now, playing.previous, jax.vmap(draw, out_axes=-1)(keys))
-    action = jnp.where(live, player(params, moment), 0)
-    now, result = task.advance(level, playing.now, action, rules)
-    after = _Playing(
-        now,
-        action,
-        playing.ended | result.done,
-        playing.solved | (~playing.ended & result.goal),
-        playing.env_steps + ~playing.ended,
-    )
-    return after, action
+def _step(player: Player, params: Any, attempt: _Attempt, rules: TaskParams) -> tuple[_Attempt, StepResult]:
+    """Take an env step in every lane, whatever happened before."""
+    level, now = attempt.level, attempt.now
+    draw = lambda key, step: jax.random.uniform(jax.random.fold_in(key, step), (ACTIONS,))
+    uniform = jax.vmap(draw, out_axes=-1)(attempt.key, now.timestep)
+    action = jnp.where(action_mask(level), player(params, Moment(level, now, attempt.previous, uniform)), 0)
+    after, result = task.advance(level, now, action, rules)
+    return attempt._replace(now=after, previous=action), result
 
 
 def _keys(level_ids: Int[Array, " level"], seed: Array, attempts: Int[Array, " attempt"]) -> Key[Array, " lane"]:
