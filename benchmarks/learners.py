@@ -1,0 +1,115 @@
+"""Policies trained by reinforcement, from scratch and from a clone: what they solve, and the core-seconds that it took.
+
+A stopped run resumes: `levelproof train` resumes from its checkpoint, and the folder keeps finished evaluations.
+"""
+
+import argparse
+import json
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from benchmarks.cloning import SAMPLED, command, interval_text
+from benchmarks.report import Report, Table
+from levelproof.configs.numbers import parse_count
+from levelproof.pipeline.learn.evaluate import ALL, SOLVED
+from levelproof.pipeline.runtime import own_cores
+
+START = "builtin:s"
+WAYS = {  # name: settings of `levelproof train`
+    "from scratch": (),
+    "from scratch, learnability": ("levels=learnability",),
+    "from a clone": (f"start={START}",),
+    "from a clone, learnability": (f"start={START}", "levels=learnability"),
+}
+COLOURS = ("#0072b2", "#56b4e9", "#d55e00", "#e69f00")
+ATTEMPTS = 8
+PLOT = "learners.svg"
+STEPS, SECONDS, RATE = "train/env_steps", "train/core_seconds", "train/solve_rate"
+
+
+def register(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=list(WAYS), help="default: all")
+    parser.add_argument("--size", default="s", help="size of the levels (default: s)")
+    parser.add_argument("--env-steps", default="10M", help="env steps of each policy (default: 10M)")
+    parser.add_argument("--seeds", type=int, default=1, help="policies of each way (default: 1)")
+    parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of all")
+    parser.add_argument("--measured", type=int, default=2048, help="sealed levels to measure on (default: 2048)")
+    parser.add_argument("--folder", type=Path, default=Path("learners"), help="where policies are kept")
+
+
+def run(args: argparse.Namespace) -> Report:
+    runs = [(way, seed) for seed in range(args.seeds) for way in args.ways]
+    with ThreadPoolExecutor(len(own_cores())) as threads:
+        results = [*threads.map(lambda one: measured(args, *one), runs)]
+    clone = evaluated(args, args.folder / "start.json", START)
+    rows = [row_of(f"the clone, {START}", None, clone)]
+    rows += [row_of(each["way"], each, each["sealed"]) for each in results]
+    players = "random", "sticky random", "its own expert, 256k"
+    rows += [row_of(name, None, clone, name) for name in players if name in clone[ALL]]
+    head = ("policy", "env steps", "core-seconds", "of all", "of solved", "of solved, best of 8")
+    given = f", with {' '.join(f'`{setting}`' for setting in args.set)}" if args.set else ""
+    return Report(
+        "Policies trained by reinforcement",
+        [*results, {"way": "start", "sealed": clone}],
+        [Table(head, rows, "Share of sealed levels solved with sampled actions, one attempt; 95% intervals")],
+        [
+            f"`levelproof train size={args.size} cores=1` for {parse_count(args.env_steps, '--env-steps'):,} env steps "
+            f"each{given}; one row per seed. Core-seconds are CPU time with compiling, without those of the clone and "
+            f"its data. *Of all*: {clone[ALL]['random']['levels']:,} levels, of which some cannot be solved; *of "
+            f"solved*: the {clone[SOLVED]['random']['levels']:,} that are labelled solved.",
+            f"![Share of episodes that reach the goal in training, against core-seconds]({PLOT})",
+            "The plot has the ways that train on fresh random levels: each episode is in a level never played before.",
+        ],
+        plots={PLOT: partial(draw, results)},
+    )
+
+
+def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
+    """Train one policy, and measure it on sealed levels."""
+    policy = args.folder / f"{way.replace(', ', '-').replace(' ', '-')}-{seed}"
+    steps = f"ppo.env_steps={parse_count(args.env_steps, '--env-steps')}"
+    command("train", f"size={args.size}", steps, f"seed={seed}", "cores=1", *WAYS[way], *args.set, "-o", policy)
+    curve = [json.loads(line) for line in (policy / "metrics.jsonl").read_text().splitlines()]
+    curve = [{name: line.get(name) for name in (STEPS, SECONDS, RATE)} for line in curve]
+    return {"way": way, "seed": seed, "curve": curve, "sealed": evaluated(args, policy / "sealed.json", policy)}
+
+
+def evaluated(args: argparse.Namespace, file: Path, policy: Path | str) -> dict[str, Any]:
+    """Return a policy's rates, from their file if an earlier run made it."""
+    if not file.exists():
+        words = "--size", args.size, "--attempts", ATTEMPTS, "--levels", args.measured, "--json"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(command("evaluate", policy, *words))
+    return json.loads(file.read_text())["levels"][0]["of"]
+
+
+def row_of(name: str, trained: dict[str, Any] | None, rates: dict[str, Any], player: str = SAMPLED) -> Sequence[str]:
+    cost = ("", "")
+    if trained:
+        last = trained["curve"][-1]
+        cost = (f"{last[STEPS]:,}", f"{last[SECONDS]:,.0f}")
+    ways = ((ALL, "once"), (SOLVED, "once"), (SOLVED, "best"))
+    return [name, *cost, *(interval_text(rates[levels][player][key]) for levels, key in ways)]
+
+
+def draw(results: Sequence[dict[str, Any]], path: Path) -> None:
+    """Plot the solve rate in training of the ways that draw levels evenly."""
+    import matplotlib
+
+    matplotlib.use("svg")
+    matplotlib.rcParams.update({"svg.hashsalt": "levelproof", "font.size": 9})
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(6, 3.5), layout="constrained")
+    for way, colour in zip(WAYS, COLOURS, strict=True):
+        for each in (one for one in results if one["way"] == way and "levels=learnability" not in WAYS[way]):
+            points = [(line[SECONDS], 100 * line[RATE]) for line in each["curve"][1:] if line[RATE] is not None]
+            axes.plot(*zip(*points, strict=True), color=colour, label=way if each["seed"] == 0 else None, linewidth=1)
+    axes.set(ylim=(0, None), xlabel="core-seconds", ylabel="episodes that reach the goal, %")
+    axes.legend(frameon=False, loc="lower right")
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, metadata={"Date": None})
+    plt.close(figure)
