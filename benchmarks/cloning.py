@@ -148,7 +148,7 @@ def draw(path: Path, results: list[dict[str, Any]]) -> None:
         axes.plot([each["levels"] for each in results], [*map(rate, results)], "o", color=colour, markersize=3)
         means = [np.mean([rate(each) for each in results if each["levels"] == count]) for count in counts]
         axes.plot(counts, means, color=colour, label=name)
-    for player in BASELINES[1:]:
+    for player in (*BASELINES[1:3], BASELINES[-1]):
         rate = 100 * results[0]["sealed"][SOLVED][player]["once"]["rate"]
         axes.axhline(rate, color=GREY, linewidth=0.7, linestyle=":")
         axes.annotate(player, (1, rate), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=7,
