@@ -1,4 +1,4 @@
-"""Policies trained by reinforcement, from scratch and from a clone: what they solve, and the core-seconds that it took.
+"""Policies trained by reinforcement, from scratch and from `builtin:s`: what they solve, and at what cost.
 
 A stopped run resumes: `levelproof train` resumes from its checkpoint, and the folder keeps finished evaluations.
 """
@@ -21,8 +21,8 @@ START = "builtin:s"
 WAYS = {  # name: settings of `levelproof train`
     "from scratch": (),
     "from scratch, learnability": ("levels=learnability",),
-    "from a clone": (f"start={START}",),
-    "from a clone, learnability": (f"start={START}", "levels=learnability"),
+    "from builtin:s": (f"start={START}",),
+    "from builtin:s, learnability": (f"start={START}", "levels=learnability"),
 }
 COLOURS = ("#0072b2", "#56b4e9", "#d55e00", "#e69f00")
 ATTEMPTS = 8
@@ -44,22 +44,22 @@ def run(args: argparse.Namespace) -> Report:
     runs = [(way, seed) for seed in range(args.seeds) for way in args.ways]
     with ThreadPoolExecutor(len(own_cores())) as threads:
         results = [*threads.map(lambda one: measured(args, *one), runs)]
-    clone = evaluated(args, args.folder / "start.json", START)
-    rows = [row_of(f"the clone, {START}", None, clone)]
+    begun = evaluated(args, args.folder / "start.json", START)
+    rows = [row_of(START, None, begun)]
     rows += [row_of(each["way"], each, each["sealed"]) for each in results]
     players = "random", "sticky random", "its own expert, 256k"
-    rows += [row_of(name, None, clone, name) for name in players if name in clone[ALL]]
+    rows += [row_of(name, None, begun, name) for name in players if name in begun[ALL]]
     head = ("policy", "env steps", "core-seconds", "of all", "of solved", "of solved, best of 8")
     given = f", with {' '.join(f'`{setting}`' for setting in args.set)}" if args.set else ""
     return Report(
         "Policies trained by reinforcement",
-        [*results, {"way": "start", "sealed": clone}],
+        [*results, {"way": "start", "sealed": begun}],
         [Table(head, rows, "Share of sealed levels solved with sampled actions, one attempt; 95% intervals")],
         [
             f"`levelproof train size={args.size} cores=1` for {parse_count(args.env_steps, '--env-steps'):,} env steps "
-            f"each{given}; one row per seed. Core-seconds are CPU time with compiling, without those of the clone and "
-            f"its data. *Of all*: {clone[ALL]['random']['levels']:,} levels, of which some cannot be solved; *of "
-            f"solved*: the {clone[SOLVED]['random']['levels']:,} that are labelled solved.",
+            f"each{given}; one row per seed. Core-seconds are CPU time with compiling, without those of {START} and "
+            f"its data. *Of all*: {begun[ALL]['random']['levels']:,} levels, of which some cannot be solved; *of "
+            f"solved*: the {begun[SOLVED]['random']['levels']:,} that are labelled solved.",
             f"![Share of episodes that reach the goal in training, against core-seconds]({PLOT})",
             "The plot has the ways that train on fresh random levels: each episode is in a level never played before.",
         ],
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> Report:
 
 def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
     """Train one policy, and measure it on sealed levels."""
-    policy = args.folder / f"{way.replace(', ', '-').replace(' ', '-')}-{seed}"
+    policy = args.folder / f"{way.replace(', ', '-').replace(' ', '-').replace(':', '-')}-{seed}"
     steps = f"ppo.env_steps={parse_count(args.env_steps, '--env-steps')}"
     command("train", f"size={args.size}", steps, f"seed={seed}", "cores=1", *WAYS[way], *args.set, "-o", policy)
     curve = [json.loads(line) for line in (policy / "metrics.jsonl").read_text().splitlines()]

@@ -16,21 +16,21 @@ class PPOConfig:
     environments: int = 512  # lanes, shared out over the cores
     horizon: int = 64  # env steps in each lane between updates
     dense_reward_scale: float = 0.2  # 1/m, of the shaping reward
-    epochs: int = 2  # passes over the samples of an update
+    epochs: int = 4  # passes over the samples of an update
     minibatches: int = 32  # updates of the weights in an epoch
     learning_rate: float = 3e-4  # Adam's step size
     adam_epsilon: float = 1e-5  # Adam's epsilon
     max_gradient_norm: float = 1.0  # maximum global norm of the gradient
     discount: float = 0.995  # discount factor of rewards, per env step
-    gae_lambda: float = 0.9  # lambda of advantage estimates (Schulman et al. 2016, arXiv:1506.02438)
+    gae_lambda: float = 0.97  # lambda of advantage estimates (Schulman et al. 2016, arXiv:1506.02438)
     clip: float = 0.2  # maximum change of the probability ratio, and of the value, in either direction
     value_weight: float = 0.5  # weight of the value function's loss
     entropy_weight: float = 0.01  # weight of the policy's entropy, a bonus in the loss
     average: float = 0.95  # weight of the past, an update, in the running average of the weights, which is the policy
     # with start=POLICY
     critic_updates: int = 10  # first updates, which fit the value function and leave the policy as it is
-    kl_weight: float = 0.2  # weight of the divergence from the start, a penalty in the loss; falls linearly to 0
-    kl_updates: int = 200  # updates after the critic's over which the penalty falls to 0
+    kl_weight: float = 0.0  # weight of the divergence from the start, a penalty in the loss; falls linearly to 0
+    kl_updates: int = 60  # updates after the critic's over which the penalty falls to 0
 
     def __post_init__(self) -> None:
         require(self, ("env_steps", "environments", "horizon", "epochs", "minibatches"), 1)

@@ -37,6 +37,7 @@ from levelproof.pipeline.words import many
 
 SEALED = "sealed"
 ATTEMPTS = 8
+WIDE = 120  # columns of a table that no terminal shows: in 80, Rich would cut long rates
 NOTHING = "doing nothing"
 ALL, NOT_TRIVIAL, SOLVED = "all", "that doing nothing does not solve", "labelled solved"  # denominators
 
@@ -91,7 +92,7 @@ def evaluate(
         print()
         return
     for group in facts:
-        _print(group, attempts, Console(highlight=False, markup=False))
+        _print(group, attempts, Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else WIDE))
     print("In brackets: 95% intervals over levels.")
     if any(group["published"] for group in facts):
         print("sfl-paper, sfl-1m-envs: the reference's agents, as it published.")
@@ -187,7 +188,7 @@ def _print(facts: dict[str, Any], attempts: int, console: Console) -> None:
         if title != ALL and count == counts[ALL]:
             continue  # the same levels
         console.print(f"{facts['levels']}: {many(count, 'level')} ({title})", soft_wrap=True)
-        table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 1))
+        table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))  # fits 80 columns
         for column in ("", "one attempt", f"best of {attempts}", "worst tenth", "steps"):
             table.add_column(column, justify="right" if table.columns else "left", no_wrap=True)
         for name, rates in players.items():

@@ -117,7 +117,8 @@ def test_start_keeps_its_weights_while_the_critic_fits(
         kept.append(load_file(out / "policy.safetensors"))
 
     monkeypatch.setattr(module, "keep_run", noted)
-    words = (f"levels={split}", f"start={agent}", "ppo.critic_updates=2", "ppo.kl_updates=2", "interval=1")
+    words = (f"levels={split}", f"start={agent}", "ppo.critic_updates=2", "ppo.kl_weight=0.2")
+    words = (*words, "ppo.kl_updates=2", "interval=1")
     curve = metrics(trained(tmp_path, 5, *words))
     before = load_file(agent / "policy.safetensors")
     same = [all((weights[name] == before[name]).all() for name in before) for weights in kept[:5]]
