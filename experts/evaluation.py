@@ -5,7 +5,6 @@ results do not depend on how levels are batched.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -150,7 +149,7 @@ def _recorder(player: Player, rules: TaskParams) -> Callable[..., Int[Array, "25
 class _Attempt(NamedTuple):
     """An episode under way in each lane."""
 
-    level: Level  # `state` is None
+    level: Level  # with its first state
     key: Key[Array, " lane"]
     now: TaskState
     previous: Int[Array, "6 lane"]
@@ -210,8 +209,7 @@ def _program(player: Player, attempts: int, rules: TaskParams, lanes: int) -> Ca
 
 def _begun(level: Level, key: Key[Array, " lane"]) -> _Attempt:
     now = task.reset(level)
-    constant = replace(level, state=None)  # pyright: ignore[reportArgumentType]
-    return _Attempt(constant, key, now, jnp.zeros((ACTIONS, len(now.timestep)), jnp.int32))
+    return _Attempt(level, key, now, jnp.zeros((ACTIONS, len(now.timestep)), jnp.int32))
 
 
 def _step(player: Player, params: Any, attempt: _Attempt, rules: TaskParams) -> tuple[_Attempt, StepResult]:

@@ -94,7 +94,7 @@ def policy_logits(
     Args:
         params: the network's parameters.
         config: the network's shape.
-        level: each lane's level, lanes last; its `state` is not read.
+        level: each lane's level, lanes last; of its `state` only scenery is read, which never moves.
         state: each lane's world.
     """
     return logits_and_summary(params, config, level.size, seen(config, level, state))[0]

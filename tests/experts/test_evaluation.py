@@ -19,7 +19,7 @@ from levelproof.experts.evaluation import (
     play_sampled,
     play_sticky,
 )
-from levelproof.experts.networks.over_levels import NetworkConfig, initial_policy
+from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy
 from levelproof.experts.witness.witness import replay
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import SIZES, Level
@@ -125,8 +125,9 @@ def test_players_draw_as_they_say(levels: Level) -> None:
 
 
 @pytest.mark.campaign
-def test_policy_plays_by_its_logits(levels: Level) -> None:
-    network = NetworkConfig(width=8, depth=1, heads=2)
+@pytest.mark.parametrize("kind", ["attention", "invariant", "flat"])
+def test_policy_plays_by_its_logits(levels: Level, kind: str) -> None:
+    network = NetworkConfig(PolicyKind(kind), width=8, depth=1, heads=2)
     params = initial_policy(jax.random.key(0), network, SIZES["s"])
     sampled, greedy = (
         [play(player, params, levels, IDS, 1, seed, DEFAULT_RULES) for seed in (0, 1)]

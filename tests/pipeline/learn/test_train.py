@@ -23,7 +23,14 @@ from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.trained_on import levels_for
 from tests.pipeline.command import ROOT, assert_refused, here
 
-LANES = ("ppo.environments=64", "ppo.horizon=32", "ppo.minibatches=4", "ppo.learning_rate=2e-3", "cores=1")
+LANES = (
+    "ppo.environments=64",
+    "ppo.horizon=32",
+    "ppo.minibatches=4",
+    "ppo.epochs=2",
+    "ppo.learning_rate=2e-3",
+    "cores=1",
+)
 TINY = ("network.width=8", "network.depth=1", "network.heads=1")
 PER_UPDATE = 64 * 32
 FILES = ("policy.safetensors", "checkpoint.safetensors", "config.json")
