@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.plotting import pyplot
 from benchmarks.report import Report, Table
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.learn.evaluate import ALL, SOLVED
@@ -132,11 +133,7 @@ def interval_text(rate: dict[str, Any]) -> str:
 
 def draw(path: Path, results: list[dict[str, Any]]) -> None:
     """Plot the rates of sampled actions on sealed and on known levels, a point per policy, beside the baselines."""
-    import matplotlib
-
-    matplotlib.use("svg")
-    matplotlib.rcParams.update({"svg.hashsalt": "levelproof", "font.size": 9})
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
     counts = sorted({each["levels"] for each in results})

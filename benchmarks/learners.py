@@ -11,7 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks.cloning import SAMPLED, command, interval_text
+from benchmarks.cloning import SAMPLED, command, interval_text, kept
+from benchmarks.plotting import pyplot
 from benchmarks.report import Report, Table
 from levelproof.configs.numbers import parse_count
 from levelproof.pipeline.learn.evaluate import ALL, SOLVED
@@ -78,12 +79,8 @@ def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
 
 
 def evaluated(args: argparse.Namespace, file: Path, policy: Path | str) -> dict[str, Any]:
-    """Return a policy's rates, from their file if an earlier run made it."""
-    if not file.exists():
-        words = "--size", args.size, "--attempts", ATTEMPTS, "--levels", args.measured, "--json"
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(command("evaluate", policy, *words))
-    return json.loads(file.read_text())["levels"][0]["of"]
+    """Return a policy's rates on sealed levels, from their file if an earlier run made it."""
+    return kept(file, policy, "--size", args.size, "--attempts", ATTEMPTS, "--levels", args.measured)
 
 
 def row_of(name: str, trained: dict[str, Any] | None, rates: dict[str, Any], player: str = SAMPLED) -> Sequence[str]:
@@ -97,11 +94,7 @@ def row_of(name: str, trained: dict[str, Any] | None, rates: dict[str, Any], pla
 
 def draw(results: Sequence[dict[str, Any]], path: Path) -> None:
     """Plot the solve rate in training of the ways that draw levels evenly."""
-    import matplotlib
-
-    matplotlib.use("svg")
-    matplotlib.rcParams.update({"svg.hashsalt": "levelproof", "font.size": 9})
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     figure, axes = plt.subplots(figsize=(6, 3.5), layout="constrained")
     for way, colour in zip(WAYS, COLOURS, strict=True):

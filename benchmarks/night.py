@@ -14,6 +14,7 @@ from typing import Any
 
 from benchmarks import oracle
 from benchmarks.plan import measured
+from benchmarks.plotting import pyplot
 from benchmarks.report import Report, Table
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.layout import split_path
@@ -152,11 +153,7 @@ def _levelproof(*arguments: str) -> str:
 
 
 def draw(samples: Sequence[Mapping[str, Any]], file: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("svg")
-    matplotlib.rcParams.update({"svg.hashsalt": "levelproof", "font.size": 9})
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(8.6, 3.4), layout="constrained")
     minutes = [(sample["time"] - samples[0]["time"]) / 60 for sample in samples]

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
+from benchmarks.plotting import pyplot
 from benchmarks.reference.actions import sticky_actions
 from benchmarks.report import Report, Table
 from levelproof.levelgen.level import SIZES, Level
@@ -128,11 +129,7 @@ def run(_: argparse.Namespace) -> Report:
 
 
 def draw(touching: dict, grown: list, file: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("svg")
-    matplotlib.rcParams.update({"svg.hashsalt": "levelproof", "font.size": 9})
-    import matplotlib.pyplot as plt
+    plt = pyplot()
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(8.6, 3.4), layout="constrained")
     for size, points in touching.items():
