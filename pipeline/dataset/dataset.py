@@ -223,10 +223,7 @@ class Dataset:
             batch = self.read(indices[which], length, first, fields, observation)
             return replace(batch, mask=batch.mask & new[:, None])
 
-        settings = {"trajectories": self.fingerprint, "validation": self._opened_with[-1]} | {
-            "subset": subset,
-            "length": length,
-        }
+        settings = self._settings(subset=subset, length=length)
         return batches_of(lambda positions: [*map(load, positions)], order, settings, epochs, prefetch, start)
 
     def episodes(
@@ -279,10 +276,7 @@ class Dataset:
             return replace(read, mask=new[read.episode]).parts(batch_size)
 
         together = max(1, EPISODES_AT_ONCE // batch_size)
-        settings = {"trajectories": self.fingerprint, "validation": self._opened_with[-1]} | {
-            "subset": subset,
-            "episodes": "first",
-        }
+        settings = self._settings(subset=subset, episodes="first")
         return batches_of(load, order, settings, epochs, prefetch, start, together)
 
     @renamed(part="subset")
@@ -350,6 +344,10 @@ class Dataset:
 
     def __repr__(self) -> str:
         return f"levelproof.open({', '.join(map(repr, self._opened_with))}) of {many(len(self), 'trajectory')}"
+
+    def _settings(self, **chosen: Any) -> dict[str, Any]:
+        """Return what decides the batches of an iterator, besides their order."""
+        return {"trajectories": self.fingerprint, "validation": self._opened_with[-1], **chosen}
 
     def _subset(self, subset: str | None) -> Int[np.ndarray, " index"]:
         if subset is None:

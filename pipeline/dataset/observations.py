@@ -15,7 +15,7 @@ from levelproof.levelgen.task.observe.kinds import observe as observe_lanes
 from levelproof.physics.types import State
 from levelproof.pipeline.errors import UserError
 
-MIN_ROWS = 1024
+MIN_ROWS = 1024  # observed at once: fewer are padded, so that few programs serve all counts
 COMPILING = Lock()  # or threads that need the same new program would each compile it
 T = TypeVar("T")
 
@@ -38,7 +38,7 @@ def observe(kind: ObservationType, level: Level, states: State) -> Any:
 def observe_rows(kind: ObservationType, level: Level, row_level: Int[np.ndarray, " row"], states: State) -> Any:
     """Observe states [row, ...], each in its level of several [level, ...]; return numpy arrays [row, ...]."""
     count = len(row_level)
-    padded = max(MIN_ROWS, 1 << (count - 1).bit_length())  # few shapes: a program serves one
+    padded = max(MIN_ROWS, 1 << (count - 1).bit_length())
     row_level, states = jax.tree.map(lambda x: np.resize(x, (padded, *x.shape[1:])), (row_level, states))
     with COMPILING:
         shown = jax.device_get(_observe_rows(kind, level, row_level, states))

@@ -39,9 +39,8 @@ def select(table: pa.Table, where: str | None) -> pa.Table:
         connection.register(TABLE, table)
         connection.execute("SET enable_external_access = false")  # conditions must not read files
         try:
-            chosen = connection.sql(f"SELECT level_id FROM {TABLE} WHERE ({with_current_names(where)}\n)").fetchnumpy()[
-                "level_id"
-            ]
+            sql = f"SELECT level_id FROM {TABLE} WHERE ({with_current_names(where)}\n)"
+            chosen = connection.sql(sql).fetchnumpy()["level_id"]
         except duckdb.Error as error:
             reason = str(error).strip().splitlines()[0]
             columns = ", ".join(COLUMNS.names)

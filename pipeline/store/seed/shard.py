@@ -96,7 +96,7 @@ class SeedShard(Shard):
         seeds: Any = parts
         names = [field.name for field in table]
         if not any(name.startswith(RECORD) for name in names):
-            level = _levels(seeds, places)
+            level = _levels(seeds, _order(places))
             return Restored(_of_levels(level, names), np.full(len(level), -1))
         made = play_seeds(seeds, places, names)
         arrays = made.level | {name: repeat_episodes(x, made.steps) for name, x in made.rows.items()}
@@ -141,13 +141,14 @@ def play_seeds(
     Raises:
         Failure: a row is invalid.
     """
-    joined = lambda arrays: _arranged(arrays, places)
-    level = _levels(parts, places)
+    order = _order(places)
+    level = _levels(parts, order)
     steps, checksum = (
-        joined([getattr(shard, name)[np.asarray(rows)] for shard, rows in parts]) for name in ("steps", "checksum")
+        _joined([getattr(shard, name)[np.asarray(rows)] for shard, rows in parts], order)
+        for name in ("steps", "checksum")
     )
     try:
-        action = joined([shard.actions(rows) for shard, rows in parts])
+        action = _joined([shard.actions(rows) for shard, rows in parts], order)
     except ValueError as error:
         raise damaged_seed(parts[0][0].path, error) from error
     wanted = frozenset(name.removeprefix(RECORD) for name in names if name.startswith(RECORD))
@@ -157,21 +158,25 @@ def play_seeds(
     return SeedEpisodes(_of_levels(level, names), steps, rows, made.observation, wrong)
 
 
-def _levels(parts: Sequence[SeedPart], places: Sequence[Sequence[int]]) -> Level:
+def _levels(parts: Sequence[SeedPart], order: np.ndarray | None) -> Level:
     """Make the levels of rows, level axis last."""
     try:
         each = [shard.levels(rows) for shard, rows in parts]
     except ValueError as error:
         raise damaged_seed(parts[0][0].path, error) from error
-    return jax.tree.map(lambda *xs: _arranged(xs, places), *each)
+    return jax.tree.map(lambda *xs: _joined(xs, order), *each)
 
 
-def _arranged(arrays: Sequence[np.ndarray], places: Sequence[Sequence[int]]) -> np.ndarray:
-    """Join the arrays of several parts, level axis last, in the order of their positions in the result."""
+def _order(places: Sequence[Sequence[int]]) -> np.ndarray | None:
+    """Return which row of the joined parts stands at each position of the result; None: they are in order."""
     order = np.argsort(np.concatenate([np.asarray(mine, int) for mine in places]))
-    if (order[1:] > order[:-1]).all():  # as of a single file, whose large arrays need no copy
-        return np.concatenate(arrays, -1) if len(arrays) > 1 else arrays[0]
-    return np.concatenate(arrays, -1)[..., order]
+    return None if (order[1:] > order[:-1]).all() else order
+
+
+def _joined(arrays: Sequence[np.ndarray], order: np.ndarray | None) -> np.ndarray:
+    """Join arrays of several parts along their last axis; copy no more than that takes, because they are large."""
+    joined = np.concatenate(arrays, -1) if len(arrays) > 1 else arrays[0]
+    return joined if order is None else joined[..., order]
 
 
 def _of_levels(level: Level, names: Sequence[str]) -> dict[str, np.ndarray]:
