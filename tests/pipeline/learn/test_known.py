@@ -15,7 +15,10 @@ from tests.pipeline.command import here
 @pytest.mark.campaign
 @pytest.mark.parametrize("size", [name for name in SIZES if known_sealed(name)])
 def test_known_sealed_levels_are_what_a_job_makes_of_them(size: str, tmp_path: Path) -> None:
-    """Another processor trains other experts: on Intel's, 5 of 32 of l have other successes than on AMD's."""
+    """Labels of a machine differ where training ends otherwise: of 32 levels hardly any does.
+
+    Of l, 5 experts have other successes on an Intel processor than on the AMD that made what is known.
+    """
     job = f"generate size={size} first_level={SEALED.start} levels=32 budget=256k executor=inline"
     assert here(job.split(), tmp_path).returncode == 0
     table = read_manifest(tmp_path / "data" / "256k" / size).table.sort_by("level_id")
@@ -24,4 +27,4 @@ def test_known_sealed_levels_are_what_a_job_makes_of_them(size: str, tmp_path: P
     made = np.array(table["label"].to_pylist()) == "solved"
     assert (made != known.solved[:32]).sum() <= 2
     successes = successes_of(table, 16)
-    assert (successes != known.successes["256k"][:32]).sum() <= 10
+    assert (successes != known.successes["256k"][:32]).sum() <= (5 if size == "l" else 4)
