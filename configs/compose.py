@@ -223,7 +223,7 @@ def compose_train(overrides: Sequence[str]) -> "TrainConfig":
     Raises:
         ConfigError: a setting is unknown, has a wrong value, or has no effect beside the others.
     """
-    from levelproof.configs.train import CURRICULA, TrainConfig  # imports flax
+    from levelproof.configs.train import CURRICULA, READ_BY, TrainConfig  # imports flax
 
     parsed = [_parse(text) for text in overrides]
     config = _changed(TrainConfig, parsed)
@@ -234,7 +234,7 @@ def compose_train(overrides: Sequence[str]) -> "TrainConfig":
         if name.partition(".")[0] in useless:
             kind = "random levels" if random else "the levels of a split or of files"
             raise ConfigError(f"{name} has no effect on {kind}, as levels={config.levels} names: leave it out.")
-        if config.levels != "learnability" and name.startswith("curriculum."):
+        if config.levels not in READ_BY.get(name.partition(".")[0], [config.levels]):
             raise ConfigError(f"{name} has no effect with levels={config.levels}: leave it out.")
         if not config.start and name in ("ppo.critic_updates", "ppo.kl_weight", "ppo.kl_updates"):
             raise ConfigError(f"{name} has no effect without start: leave it out.")

@@ -3,18 +3,20 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from levelproof.experts.generalist.config import CurriculumConfig, PPOConfig
+from levelproof.experts.generalist.config import CurriculumConfig, EvolveConfig, PPOConfig, ReplayConfig
 from levelproof.experts.networks.over_levels import NetworkConfig
 from levelproof.physics.bounds import require
 
-CURRICULA = ("uniform", "learnability")  # curricula over random levels
+CURRICULA = ("uniform", "learnability", "replay", "evolve")  # curricula over random levels
+# Groups of settings, and the curricula that read them
+READ_BY = {"curriculum": ("learnability",), "replay": ("replay", "evolve"), "evolve": ("evolve",)}
 
 
 @dataclass(frozen=True)
 class TrainConfig:
     """What to train on, and how."""
 
-    levels: str = "uniform"  # uniform or learnability: random levels; else a split, or level files
+    levels: str = "uniform"  # uniform, learnability, replay or evolve: random levels; else a split, or level files
     size: str = "s"  # size of random levels
     distribution: str = "kinetix"  # preset of random levels
     where: str = "label NOT IN ('trivial', 'unsolvable')"  # SQL condition that selects levels of a split
@@ -26,6 +28,8 @@ class TrainConfig:
     network: NetworkConfig = field(default_factory=NetworkConfig)  # network of a policy from scratch
     ppo: PPOConfig = field(default_factory=PPOConfig)  # training of the policy
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)  # choice of levels with levels=learnability
+    replay: ReplayConfig = field(default_factory=ReplayConfig)  # choice of levels with levels=replay or evolve
+    evolve: EvolveConfig = field(default_factory=EvolveConfig)  # new levels with levels=evolve
 
     def __post_init__(self) -> None:
         require(self, ("interval",), 1)
@@ -33,3 +37,6 @@ class TrainConfig:
         require(self, ("seed",), 0, 2**31 - 1)
         if not self.levels:
             raise ValueError(f"levels is empty: choose one of {', '.join(CURRICULA)}, a split or level files")
+        children, capacity = self.evolve.children, self.replay.capacity
+        if self.levels == "evolve" and children > capacity:
+            raise ValueError(f"evolve.children is {children}: it must not exceed replay.capacity = {capacity}")

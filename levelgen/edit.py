@@ -262,9 +262,13 @@ def _weigh(one: Level, body: int, fixed: bool) -> None:
         area, inertia = circle_area(radius), circle_inertia(radius)
     else:
         corners, count = one.model.vertices[body][None, ..., None], one.model.n_vertices[body][None, None]
-        area, inertia = polygon_area(corners, count)[0, 0], polygon_inertia(corners, count)[0, 0]
+        area, inertia = (np.asarray(x)[0, 0] for x in _area_and_inertia(corners, count))
     for values, value in ((one.model.inverse_mass, area), (one.model.inverse_inertia, inertia)):
         values[body] = 0.0 if fixed else inverse(value * one.density[body])
+
+
+# Compiled: operation by operation it takes a hundred times as long
+_area_and_inertia = jax.jit(lambda corners, count: (polygon_area(corners, count), polygon_inertia(corners, count)))
 
 
 def _joints(one: Level) -> Iterator[tuple[int, int, Any, Any]]:

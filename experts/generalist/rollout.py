@@ -31,6 +31,7 @@ class Playing(NamedTuple):
     state: LaneState
     played: LevelTable  # each lane's level
     gained: Float[Array, " lane"]  # reward so far
+    valued: Float[Array, " lane"]  # sum of the values of the states so far
 
 
 class Ended(NamedTuple):
@@ -40,6 +41,8 @@ class Ended(NamedTuple):
     goal: Bool[Array, "time lane"]
     steps: Int[Array, "time lane"]
     gained: Float[Array, "time lane"]  # reward
+    valued: Float[Array, "time lane"]  # sum of the values of their states
+    level_index: Int[Array, "time lane"]
 
 
 class Experience(NamedTuple):
@@ -66,14 +69,11 @@ def table_of(levels: Level | Sampler, rules: TaskParams) -> Table:
     return lanes_of(levels.size, rules).table(EnvParams(levels))
 
 
-def size_of_table(table: Table) -> Size:
-    return table.size if isinstance(table, Sampler) else table.level.size
-
-
 def begin(table: Table, level_index: Int[Array, " lane"], rules: TaskParams) -> Playing:
     """Start an episode of these levels in every lane."""
-    _, state, played = lanes_of(size_of_table(table), rules).reset(table, level_index)
-    return Playing(state, played, jnp.zeros(level_index.shape))
+    _, state, played = lanes_of(table.size, rules).reset(table, level_index)
+    nothing = jnp.zeros(level_index.shape)
+    return Playing(state, played, nothing, nothing)
 
 
 def rollout(
@@ -101,7 +101,7 @@ def rollout(
     Returns:
         The episodes under way, the experience, and the episodes that ended.
     """
-    size = size_of_table(table)
+    size = table.size
     lanes = lanes_of(size, rules)
     count = playing.gained.shape[-1]
 
@@ -115,12 +115,13 @@ def rollout(
         log_before = log_probability(logits, action, live)
         coming = draw(of_level, count)
         _, after, _, reward, done, info = lanes.step(table, now.played, now.state, action, coming)
-        gained = now.gained + reward
-        ended = Ended(done, info["GoalR"], after.now.timestep, gained)
+        gained, valued = now.gained + reward, now.valued + value
+        ended = Ended(done, info["GoalR"], after.now.timestep, gained, valued, info["level_index"])
         restart = lambda ids: lanes.reset(table, ids)[1:]
         state, played = renewed(done, coming, restart, (after, now.played))
         sample_of_step = Experience(observation, live, action, log_before, value, reward, done, info["terminated"])
-        return Playing(state, played, jnp.where(done, 0.0, gained)), (sample_of_step, ended)
+        left = (jnp.where(done, 0.0, total) for total in (gained, valued))
+        return Playing(state, played, *left), (sample_of_step, ended)
 
     after, (experience, ended) = jax.lax.scan(act, playing, jnp.arange(steps))
     return after, experience, ended

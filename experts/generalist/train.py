@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from levelproof.experts.generalist.actor_critic import ActorCriticParams, initial_actor_critic, logits_and_value
 from levelproof.experts.generalist.config import CHUNK, PPOConfig
-from levelproof.experts.generalist.curricula import Curriculum
-from levelproof.experts.generalist.rollout import Experience, Playing, begin, rollout
+from levelproof.experts.generalist.curricula import Curriculum, EndedEpisodes
+from levelproof.experts.generalist.rollout import Ended, Experience, Playing, begin, rollout
 from levelproof.experts.networks.layers import LOGITS
 from levelproof.experts.networks.over_levels import NetworkConfig, logits_and_summary
 from levelproof.experts.objective import advantages, normalised, terms
@@ -30,7 +30,7 @@ from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.types import Size
 
 CORES = "core"  # axis of the mesh
-BEGINNING, PLAYING, MEASURING = range(1, 4)  # folded into the seed's key; clones take its own
+BEGINNING, PLAYING, MEASURING, BREEDING = range(1, 5)  # folded into the seed's key; clones take its own
 TERMS = 4  # means over samples in UpdateFacts
 
 
@@ -70,11 +70,11 @@ class TrainingRecipe(NamedTuple):
 
 
 class Programs(NamedTuple):
-    """Compiled functions of a training; they donate the learner."""
+    """Functions of a training; they donate the learner."""
 
     begin: Callable[[Table, VariableDict | None], Learner]
     advance: Callable[[Learner, Table, VariableDict | None], tuple[Learner, UpdateFacts]]
-    measure: Callable[[Learner, Table], Learner]
+    look_around: Callable[[Learner, Table], Learner]  # every few updates, if the curriculum measures or makes levels
 
 
 class Chunk(NamedTuple):
@@ -111,10 +111,11 @@ def programs_of(recipe: TrainingRecipe, table: Table, start: VariableDict | None
         return jax.jit(mapped, donate_argnums=(0,) if donated else ())
 
     to_mesh = jax.tree.map(lambda spec: NamedSharding(mesh, spec), kept, is_leaf=lambda x: x is whole)
+    breeds = recipe.curriculum.breed is not None
     return Programs(
         jax.jit(partial(_begin, recipe), out_shardings=to_mesh),
         on_cores(_advance, (kept, whole), True, kept, whole, whole),
-        on_cores(_measure, kept, True, kept, whole),
+        partial(_breed, recipe, NamedSharding(mesh, whole)) if breeds else on_cores(_measure, kept, True, kept, whole),
     )
 
 
@@ -128,6 +129,7 @@ def _begin(recipe: TrainingRecipe, table: Table, start: VariableDict | None) -> 
     of_weights, of_levels = jax.random.split(jax.random.fold_in(key_of_seed(recipe.seed), BEGINNING))
     params = initial_actor_critic(of_weights, recipe.network, recipe.size, start)
     state = recipe.curriculum.begin()
+    table = recipe.curriculum.table(table, state)
     levels = recipe.curriculum.draw(table, state, of_levels, recipe.ppo.environments)
     playing = begin(table, levels, recipe.rules)
     # A copy, because the learner is donated, and no buffer can be donated twice
@@ -142,6 +144,7 @@ def _advance(
     ppo, update = recipe.ppo, learner.updates
     key = jax.random.fold_in(_key(recipe, update), jax.lax.axis_index(CORES))
     of_rollout, of_epochs = jax.random.split(key)
+    table = recipe.curriculum.table(table, learner.curriculum)
     draw = partial(recipe.curriculum.draw, table, learner.curriculum)
     playing, experience, ended = rollout(
         learner.params, recipe.network, table, learner.playing, draw, of_rollout, ppo.horizon,
@@ -154,12 +157,17 @@ def _advance(
         optimiser,
         _averaged(learner.average, params.policy, update, ppo),
         playing,
-        learner.curriculum,
+        recipe.curriculum.learn(learner.curriculum, _of_all_cores(ended)),
         update + 1,
     )
     count = lambda x: jnp.where(ended.done, x, 0).sum()
     sums = jax.lax.psum((ended.done.sum(), count(ended.goal), count(ended.steps), count(ended.gained)), CORES)
     return after, UpdateFacts(*sums, *means)
+
+
+def _of_all_cores(ended: Ended) -> EndedEpisodes:
+    mine = EndedEpisodes(ended.done, ended.level_index, ended.gained, ended.valued / ended.steps)
+    return jax.tree.map(lambda x: jax.lax.all_gather(x.reshape(-1), CORES, tiled=True), mine)
 
 
 def _advantages(experience: Experience, config: PPOConfig) -> Float[Array, "time lane"]:
@@ -292,3 +300,10 @@ def _measure(recipe: TrainingRecipe, learner: Learner, table: Table) -> Learner:
 
     key = jax.random.fold_in(jax.random.fold_in(key_of_seed(recipe.seed), MEASURING), learner.updates)
     return learner._replace(curriculum=curriculum.measure(table, attempt, key))
+
+
+def _breed(recipe: TrainingRecipe, everywhere: NamedSharding, learner: Learner, table: Table) -> Learner:
+    """Have the curriculum make levels, on the host."""
+    assert recipe.curriculum.breed
+    rng = np.random.default_rng((recipe.seed, BREEDING, int(learner.updates)))
+    return learner._replace(curriculum=jax.device_put(recipe.curriculum.breed(learner.curriculum, rng), everywhere))

@@ -30,6 +30,7 @@ from levelproof.physics.lanes import Ref
 from levelproof.physics.types import FIXED_POLYGONS, Size
 
 CHUNK = 256  # levels per call of the compiled program, which is padded to this
+FRESH_IDS = 1 << FRESH_BITS  # ids of fresh levels are below, those that policies are measured on above
 DEFAULT = Distribution()
 
 
@@ -104,7 +105,7 @@ class Sampler:
         return sample(jnp.asarray(level_ids, jnp.int32), self.size, self.distribution)
 
     def draw_id(self, key: Key[Array, ""]) -> Int[Array, ""]:
-        """Draw a level id below 2**FRESH_BITS, so that it is never one of those that policies are measured on."""
+        """Draw a level id below FRESH_IDS, so that it is never one of those that policies are measured on."""
         return self.draw_ids(key, ())
 
     def draw_ids(self, key: Key[Array, ""], shape: tuple[int, ...]) -> Int[Array, "..."]:

@@ -13,12 +13,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.sampling.sampler import Sampler
+from levelproof.levelgen.sampling.sampler import FRESH_IDS, Sampler
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.environment import CONTROLS, Environment, EnvParams
 from levelproof.levelgen.task.fresh import renewed
 from levelproof.levelgen.task.observe.kinds import constant_features, observe
 from levelproof.levelgen.task.rules import TaskState
+from levelproof.physics.types import Size
 
 
 @jax.tree_util.register_dataclass
@@ -30,6 +31,27 @@ class LevelTable:
     start: TaskState | None  # first state of an episode in each level; None for levels that lanes play
     features: Float[Array, "feature level"]  # constant part of the symbolic-flat observation; no rows for other types
 
+    @property
+    def size(self) -> Size:
+        return self.level.size
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class ExtendedTable:
+    """Random levels by id, and extra ones, which may change while lanes play.
+
+    Index i < FIRST_EXTRA is the random level with this id; FIRST_EXTRA + i is column i % len(levels) of `levels`. So
+    levels that follow one another in a column can have an index each.
+    """
+
+    sampler: Sampler
+    levels: Level
+
+    @property
+    def size(self) -> Size:
+        return self.sampler.size
+
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
@@ -40,7 +62,8 @@ class LaneState:
     level_index: Int[Array, " lane"]  # into the table
 
 
-Table = LevelTable | Sampler
+FIRST_EXTRA = FRESH_IDS  # ids of random levels are below
+Table = LevelTable | Sampler | ExtendedTable
 LaneStep = tuple[Any, LaneState, LevelTable, Float[Array, " lane"], Bool[Array, " lane"], dict[str, Any]]
 
 
@@ -70,6 +93,11 @@ class Lanes:
     def _columns(self, table: Table, level_index: Int[Array, " lane"]) -> LevelTable:
         if isinstance(table, Sampler):
             return self._table(table.lanes(level_index))
+        if isinstance(table, ExtendedTable):
+            extra, sampled = level_index >= FIRST_EXTRA, table.sampler.lanes(level_index % FIRST_EXTRA)
+            column = (level_index - FIRST_EXTRA) % len(table.levels)
+            chosen = jax.tree.map(lambda x, y: jnp.where(extra, x[..., column], y), table.levels, sampled)
+            return self._table(chosen)
         return jax.tree.map(lambda x: x[..., level_index], table)
 
     def reset(self, table: Table, level_index: Int[Array, " lane"]) -> tuple[Any, LaneState, LevelTable]:

@@ -13,12 +13,18 @@ from rich.console import Console
 
 from levelproof.configs.convert import plain
 from levelproof.configs.train import TrainConfig
-from levelproof.experts.generalist.curricula import curriculum_of
+from levelproof.experts.generalist.curricula import UNIFORM, Curriculum
+from levelproof.experts.generalist.evolve import evolve
+from levelproof.experts.generalist.learnability import learnability
+from levelproof.experts.generalist.replay import replay
 from levelproof.experts.generalist.rollout import table_of
 from levelproof.experts.generalist.train import Learner, Programs, TrainingRecipe, UpdateFacts, programs_of
 from levelproof.experts.networks.over_levels import PolicyKind
 from levelproof.experts.networks.saved import WEIGHTS, Policy, policy_folder
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.sampling.sampler import Sampler
 from levelproof.levelgen.task.lanes import Table
+from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.learn.curves import BLUE, GREEN, Curves, Panel
@@ -120,9 +126,21 @@ def recipe_of(config: TrainConfig, source: TrainingLevels, start: Policy | None,
     except ValueError as error:
         raise UserError(f"ppo.{error}.") from None
     rules = replace(source.rules, dense_reward_scale=config.ppo.dense_reward_scale)
-    curriculum = curriculum_of(config.levels, config.curriculum)
     network = start.network if start else config.network
+    curriculum = curriculum_of(config, source.levels, rules)
     return TrainingRecipe(network, source.levels.size, config.ppo, curriculum, rules, config.seed)
+
+
+def curriculum_of(config: TrainConfig, levels: Level | Sampler, rules: TaskParams) -> Curriculum:
+    """Return the curriculum that the settings name; levels of a split or of files are drawn evenly."""
+    if config.levels == "learnability":
+        return learnability(config.curriculum)
+    if config.levels == "replay":
+        return replay(config.replay)
+    if config.levels == "evolve":
+        assert isinstance(levels, Sampler)
+        return evolve(config.evolve, config.replay, levels, rules)
+    return UNIFORM
 
 
 def note_of(config: TrainConfig, source: TrainingLevels, cores: int) -> dict[str, Any]:
@@ -155,7 +173,7 @@ def update_until_done(
     with shown(console, "compiling", last, first) as show:
         for update in range(first + 1, last + 1):
             if every and (update - 1) % every == 0:
-                learner = programs.measure(learner, table)
+                learner = programs.look_around(learner, table)
             learner, facts = programs.advance(learner, table, start)
             recent.append(jax.device_get(facts))
             if update == first + 1:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from levelproof.experts.generalist.config import CurriculumConfig, PPOConfig
-from levelproof.experts.generalist.curricula import UNIFORM, curriculum_of, fresh
+from levelproof.experts.generalist.curricula import fresh
+from levelproof.experts.generalist.learnability import learnability
 from levelproof.experts.generalist.rollout import Experience, table_of
 from levelproof.experts.generalist.train import _advantages, _averaged, _kl_weight
 from levelproof.experts.policy import divergence, log_probability
@@ -72,7 +73,7 @@ def test_random_levels_are_never_sealed_and_table_levels_are_all_drawn() -> None
 
 def test_learnability_keeps_levels_that_are_sometimes_solved() -> None:
     config = CurriculumConfig(share=0.75, candidates=64, keep=16)
-    curriculum = curriculum_of("learnability", config)
+    curriculum = learnability(config)
     table, key = sampler("s"), jax.random.key(1)
     before = np.asarray(curriculum.draw(table, curriculum.begin(), key, 1000))
     assert len(np.unique(before)) > 990, "nothing is measured yet: all levels are fresh"
@@ -91,4 +92,3 @@ def test_learnability_keeps_levels_that_are_sometimes_solved() -> None:
     assert np.isin(drawn, np.asarray(state.level_index)).mean() == pytest.approx(0.75, abs=0.05)
     never = curriculum.measure(table, lambda ids, steps, key: (jnp.ones(len(ids)), jnp.zeros(len(ids))), key)
     assert int(never.usable) == 0
-    assert curriculum_of("data/64k/s", CurriculumConfig()) is UNIFORM

@@ -15,7 +15,8 @@ from levelproof.configs.compose import override_of
 from levelproof.configs.convert import plain
 from levelproof.configs.meanings import comments_in
 from levelproof.configs.train import TrainConfig
-from levelproof.experts.generalist.config import CurriculumConfig, PPOConfig
+from levelproof.experts.generalist.config import CurriculumConfig, EvolveConfig, PPOConfig, ReplayConfig
+from levelproof.levelgen.task.lanes import FIRST_EXTRA
 from levelproof.pipeline.exchange.level_json import export
 from levelproof.pipeline.learn import sealed
 from levelproof.pipeline.learn import train as module
@@ -94,7 +95,19 @@ def test_folder_holds_a_policy_that_loads_and_is_evaluated(agent: Path, split: P
 def test_run_that_was_stopped_continues_bit_for_bit(
     easy: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ("interval=2", *easy)
+    continues_bit_for_bit(easy, tmp_path, monkeypatch)
+
+
+@pytest.mark.campaign
+def test_stopped_run_with_edited_levels_continues_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = "levels=evolve", "replay.capacity=16", "evolve.children=8", "evolve.every=1", *TINY
+    kept = load_file(continues_bit_for_bit(words, tmp_path, monkeypatch) / "checkpoint.safetensors")
+    (index,) = (x for name, x in kept.items() if name.endswith(".level_index") and ".buffer" in name)
+    assert (index >= FIRST_EXTRA).any()
+
+
+def continues_bit_for_bit(words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    words = ("interval=2", *words)
     whole = trained(tmp_path / "whole", 4, *words)
     keep = module.keep_run
 
@@ -111,6 +124,7 @@ def test_run_that_was_stopped_continues_bit_for_bit(
     for name in FILES:
         assert (out / name).read_bytes() == (whole / name).read_bytes()
     assert metrics(out)[-1]["train/return"] == metrics(whole)[-1]["train/return"]
+    return out
 
 
 def test_start_keeps_its_weights_while_the_critic_fits(
@@ -146,6 +160,14 @@ def test_random_levels_are_measured_for_learnability(tmp_path: Path) -> None:
     assert 0 < usable <= 16
 
 
+@pytest.mark.campaign
+def test_random_levels_are_replayed(tmp_path: Path) -> None:
+    out = trained(tmp_path, 6, "levels=replay", "replay.capacity=8", *TINY)
+    kept = {name: x for name, x in load_file(out / "checkpoint.safetensors").items() if name.startswith(".curriculum")}
+    assert kept[".curriculum.cumulative"][-1] == 1
+    assert np.isfinite(kept[".curriculum.score"]).all()
+
+
 def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     messages: list[str] = []
     source = levels_for(TrainConfig(levels=str(split), where="label = 'solved'"), messages.append)
@@ -171,6 +193,8 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (["size=s", "levels=some/split"], "size has no effect"),
         (["where=label = 'solved'"], "where has no effect on random levels"),
         (["curriculum.keep=4"], "no effect with levels=uniform"),
+        (["levels=replay", "evolve.edits=4"], "no effect with levels=replay"),
+        (["levels=evolve", "replay.capacity=4"], "evolve.children is 64: it must not exceed replay.capacity = 4"),
         (["ppo.kl_weight=1"], "no effect without start"),
         (["start=policy", "network.width=8"], "network.width is that of the policy to start from"),
         (["distribution=kinetx"], "did you mean kinetix?"),
@@ -194,7 +218,8 @@ def test_folder_of_another_run_is_refused(agent: Path, easy: tuple[str, ...], tm
 
 def test_guide_lists_every_setting_with_its_default_and_meaning() -> None:
     guide = (ROOT / "docs/finetune.md").read_text()
-    for path, cls in ("", TrainConfig), ("ppo.", PPOConfig), ("curriculum.", CurriculumConfig):
+    groups = {"": TrainConfig, "ppo.": PPOConfig, "curriculum.": CurriculumConfig}
+    for path, cls in (groups | {"replay.": ReplayConfig, "evolve.": EvolveConfig}).items():
         for name, comment in comments_in(cls).items():
             value = getattr(cls(), name)
             if not is_dataclass(value):

@@ -1,0 +1,44 @@
+"""The curriculum by learnability: Rutherford et al. 2024 (arXiv:2408.15099), sampling for learnability."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int, Key
+
+from levelproof.experts.generalist.config import CurriculumConfig
+from levelproof.experts.generalist.curricula import Attempt, Curriculum, fresh
+from levelproof.levelgen.task.lanes import Table
+
+
+class Learnable(NamedTuple):
+    """Levels that the policy sometimes solves, best first."""
+
+    level_index: Int[Array, " level"]
+    usable: Int[Array, ""]  # number of them; the others are not drawn
+
+
+def learnability(config: CurriculumConfig) -> Curriculum:
+    """Return the curriculum.
+
+    Every now and then the policy attempts fresh levels; those that it solves at a rate p with the largest p(1 - p) are
+    drawn until the next measurement, beside fresh ones.
+    """
+
+    def draw(table: Table, state: Learnable, key: Key[Array, ""], lanes: int) -> Int[Array, " lane"]:
+        of_fresh, of_share, of_choice = jax.random.split(key, 3)
+        chosen = state.level_index[jax.random.randint(of_choice, (lanes,), 0, jnp.maximum(state.usable, 1))]
+        takes = (jax.random.uniform(of_share, (lanes,)) < config.share) & (state.usable > 0)
+        return jnp.where(takes, chosen, fresh(table, of_fresh, lanes))
+
+    def measure(table: Table, attempt: Attempt, key: Key[Array, ""]) -> Learnable:
+        of_levels, of_attempts = jax.random.split(key)
+        candidates = fresh(table, of_levels, config.candidates)
+        episodes, solved = attempt(candidates, config.measured_steps, of_attempts)
+        rate = solved / jnp.maximum(episodes, 1)
+        # As in the authors' code, n / (n + 1) holds back rates of few episodes n
+        score, best = jax.lax.top_k(rate * (1 - rate) * episodes / (episodes + 1), config.keep)
+        return Learnable(candidates[best], (score > 0).sum(dtype=jnp.int32))
+
+    nothing = lambda: Learnable(jnp.zeros(config.keep, jnp.int32), jnp.int32(0))
+    return Curriculum(nothing, draw, every=config.every, measure=measure)
