@@ -19,13 +19,18 @@ from levelproof.pipeline.learn.evaluate import ALL, SOLVED
 from levelproof.pipeline.runtime import own_cores
 
 START = "builtin:s"
+OFTEN = "curriculum.every=25", "curriculum.measured_steps=512"  # in a short training
 WAYS = {  # name: settings of `levelproof train`
     "from scratch": (),
-    "from scratch, learnability": ("levels=learnability",),
+    "from scratch, learnability": ("levels=learnability", *OFTEN),
+    "from scratch, replay": ("levels=replay",),
+    "from scratch, evolve": ("levels=evolve",),
     "from builtin:s": (f"start={START}",),
-    "from builtin:s, learnability": (f"start={START}", "levels=learnability"),
+    "from builtin:s, learnability": (f"start={START}", "levels=learnability", *OFTEN),
+    "from builtin:s, replay": (f"start={START}", "levels=replay"),
+    "from builtin:s, evolve": (f"start={START}", "levels=evolve"),
 }
-COLOURS = ("#0072b2", "#56b4e9", "#d55e00", "#e69f00")
+PLOTTED = {"from scratch": "#0072b2", "from builtin:s": "#d55e00"}  # ways that draw levels evenly
 ATTEMPTS = 8
 PLOT = "learners.svg"
 STEPS, SECONDS, RATE = "train/env_steps", "train/core_seconds", "train/solve_rate"
@@ -93,12 +98,12 @@ def row_of(name: str, trained: dict[str, Any] | None, rates: dict[str, Any], pla
 
 
 def draw(results: Sequence[dict[str, Any]], path: Path) -> None:
-    """Plot the solve rate in training of the ways that draw levels evenly."""
+    """Plot the solve rate in training of the ways PLOTTED."""
     plt = pyplot()
 
     figure, axes = plt.subplots(figsize=(6, 3.5), layout="constrained")
-    for way, colour in zip(WAYS, COLOURS, strict=True):
-        for each in (one for one in results if one["way"] == way and "levels=learnability" not in WAYS[way]):
+    for way, colour in PLOTTED.items():
+        for each in (one for one in results if one["way"] == way):
             points = [(line[SECONDS], 100 * line[RATE]) for line in each["curve"][1:] if line[RATE] is not None]
             axes.plot(*zip(*points, strict=True), color=colour, label=way if each["seed"] == 0 else None, linewidth=1)
     axes.set(ylim=(0, None), xlabel="core-seconds", ylabel="episodes that reach the goal, %")
