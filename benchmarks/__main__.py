@@ -43,6 +43,7 @@ BENCHMARKS = {  # name: (module, what it measures)
     "workers": ("benchmarks.workers", "how much faster two workers are than one, and what a thousand cost the driver"),
     "cloning": ("benchmarks.cloning", "how cloned policies solve unseen levels, against the number of levels"),
     "learners": ("benchmarks.learners", "what policies trained by reinforcement solve, and at what cost"),
+    "agents": ("benchmarks.agents", "how policies play the levels of the reference's published agents"),
     "cold": ("benchmarks.cold", "how long the first levels take with nothing compiled, and the next ones"),
     "readme": ("benchmarks.readme", "the README's commands in a fresh clone and environment"),
 }
