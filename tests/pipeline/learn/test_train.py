@@ -16,6 +16,7 @@ from levelproof.configs.convert import plain
 from levelproof.configs.meanings import comments_in
 from levelproof.configs.train import TrainConfig
 from levelproof.experts.generalist.config import CurriculumConfig, PPOConfig
+from levelproof.experts.generalist.train import _programs as programs
 from levelproof.pipeline.exchange.level_json import export
 from levelproof.pipeline.learn import sealed
 from levelproof.pipeline.learn import train as module
@@ -96,7 +97,7 @@ def test_run_that_was_stopped_continues_bit_for_bit(
 ) -> None:
     words = ("interval=2", *easy)
     whole = trained(tmp_path / "whole", 4, *words)
-    keep = module.keep_run
+    keep, made = module.keep_run, programs.cache_info().misses
 
     def stopped(*arguments: Any) -> None:
         keep(*arguments)
@@ -108,6 +109,7 @@ def test_run_that_was_stopped_continues_bit_for_bit(
     assert load_file(tmp_path / "stopped/agent/checkpoint.safetensors")[".updates"] == 2
     monkeypatch.undo()
     out = trained(tmp_path / "stopped", 4, *words)
+    assert programs.cache_info().misses == made, "equal runs share their programs"
     for name in FILES:
         assert (out / name).read_bytes() == (whole / name).read_bytes()
     assert metrics(out)[-1]["train/return"] == metrics(whole)[-1]["train/return"]
