@@ -17,7 +17,13 @@ NOT_REACHED = "not reached: "
 # in another process, because they need none of those programs. Groups that compile without XLA's optimiser come last: a
 # process that goes back to optimising has to forget its programs.
 TOGETHER = {
-    "brief experts": ("tests/experts/generalist", "tests/experts/networks"),
+    "brief experts": (
+        "tests/experts/generalist",
+        "tests/experts/networks",
+        "tests/experts/test_evaluation",
+        "tests/experts/test_policy",
+        "tests/experts/training/test_ppo",
+    ),
     "jobs": ("tests/pipeline/jobs", "tests/pipeline/cli", "tests/test_manifests", "tests/benchmarks/test_handmade"),
     "experts": ("tests/experts",),
     "look": ("tests/pipeline/look/test_show", "tests/pipeline/look/test_gallery"),

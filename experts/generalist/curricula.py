@@ -30,7 +30,10 @@ class EndedEpisodes(NamedTuple):
 
 
 class Curriculum(NamedTuple):
-    """Which levels come next. All but `breed` are pure, and all but `draw` get equal arguments on every core."""
+    """Which levels come next. All functions but `breed` are pure, and all but `draw` get equal arguments on every core.
+
+    Programs are kept by their curriculum: make the same one for equal settings.
+    """
 
     begin: Callable[[], State]
     draw: Callable[[Table, State, Key[Array, ""], int], Int[Array, " lane"]]  # the next level of each lane

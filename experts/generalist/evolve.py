@@ -5,7 +5,7 @@ takes the slot of a level with a low score and waits there for its first attempt
 are in such children, half in fresh random levels; from then on a child is scored like any other level.
 """
 
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -40,6 +40,7 @@ class Population(NamedTuple):
     generation: Int[Array, ""]
 
 
+@cache
 def evolve(config: EvolveConfig, buffer: ReplayConfig, sampler: Sampler, rules: TaskParams) -> Curriculum:
     """Return the curriculum over levels of a sampler, played by these rules."""
     return Curriculum(

@@ -1,5 +1,6 @@
 """The curriculum by learnability: Rutherford et al. 2024 (arXiv:2408.15099), sampling for learnability."""
 
+from functools import cache
 from typing import NamedTuple
 
 import jax
@@ -18,6 +19,7 @@ class Learnable(NamedTuple):
     usable: Int[Array, ""]  # number of them; the others are not drawn
 
 
+@cache
 def learnability(config: CurriculumConfig) -> Curriculum:
     """Return the curriculum.
 

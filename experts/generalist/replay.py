@@ -6,7 +6,7 @@ was solved once, and that the critic does not expect to solve, comes first. Unli
 levels that are new, too: half of all samples would otherwise be for nothing.
 """
 
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
@@ -30,6 +30,7 @@ class ReplayBuffer(NamedTuple):
     cumulative: Float[Array, " slot"]  # sums of chances to be replayed, up to 1; 0: the buffer is not full enough
 
 
+@cache
 def replay(config: ReplayConfig) -> Curriculum:
     """Return the curriculum: with a chance of `share` a level of the buffer, else a fresh one."""
 

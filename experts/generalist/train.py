@@ -5,7 +5,8 @@ change one set of weights, of which every core has a copy.
 """
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import replace
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -98,9 +99,18 @@ def programs_of(recipe: TrainingRecipe, table: Table, start: VariableDict | None
         start: parameters of the policy that training starts from; None: from scratch. Gives shapes only.
         cores: devices to share the lanes out over.
     """
+    leaves, tree = jax.tree.flatten((table, start))
+    shapes = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves)
+    # The end of training is not part of any program
+    return _programs(recipe._replace(ppo=replace(recipe.ppo, env_steps=1)), shapes, tree, cores)
+
+
+@lru_cache(maxsize=8)
+def _programs(recipe: TrainingRecipe, shapes: tuple[jax.ShapeDtypeStruct, ...], tree: Any, cores: int) -> Programs:
+    """Make the programs once for equal arguments: a function that is jitted anew is traced and compiled anew."""
     mesh = Mesh(np.array(jax.devices()[:cores]), (CORES,))
     whole = PartitionSpec()
-    shape = jax.eval_shape(partial(_begin, recipe), table, start)
+    shape = jax.eval_shape(partial(_begin, recipe), *jax.tree.unflatten(tree, shapes))
     by_lane = lambda x: PartitionSpec(*[None] * (x.ndim - 1), CORES)
     kept = Learner(whole, whole, whole, jax.tree.map(by_lane, shape.playing), whole, whole)  # pyright: ignore
 

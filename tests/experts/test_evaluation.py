@@ -29,6 +29,7 @@ from levelproof.levelgen.task.actions import CHOICES, action_mask
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 
 IDS, ATTEMPTS = np.arange(700, 724), 3
+FEW = 2  # lanes; with more attempts than lanes, one program serves any number of attempts
 
 
 @pytest.fixture(scope="module")
@@ -41,16 +42,23 @@ def played(levels: Level) -> evaluation.FirstEpisodes:
     return play(play_randomly, (), levels, IDS, ATTEMPTS, 1, DEFAULT_RULES)
 
 
+@jax.jit
+def drawn(level_id: jax.Array, attempt: jax.Array) -> jax.Array:
+    """Return the random numbers of an attempt with seed 1, time axis first."""
+    key = evaluation._keys(level_id[None], jnp.uint32(1), jnp.arange(ATTEMPTS))[attempt]
+    draw = lambda step: jax.random.uniform(jax.random.fold_in(key, step), (6,))
+    return jax.lax.map(draw, jnp.arange(RECORD_STEPS))
+
+
 def test_attempts_equal_a_plain_loop(levels: Level, played: evaluation.FirstEpisodes) -> None:
     """One lane, one step at a time, the actions drawn from the same keys."""
     step = jax.jit(partial(task.advance, params=DEFAULT_RULES))
     for number, attempt in ((0, 0), (5, 2), (11, 1)):
         level = take(levels, np.array([number]))
-        key = evaluation._keys(jnp.array([IDS[number]]), jnp.uint32(1), jnp.arange(ATTEMPTS))[attempt]
+        uniform = np.asarray(drawn(IDS[number], attempt))
         now, steps, goal = task.reset(level), 0, False
         while steps < RECORD_STEPS:
-            uniform = jax.random.uniform(jax.random.fold_in(key, steps), (6,))
-            action = np.floor(np.asarray(uniform) * CHOICES).astype(np.int32)[:, None]
+            action = np.floor(uniform[steps] * CHOICES).astype(np.int32)[:, None]
             now, result = step(level, now, np.where(action_mask(level), action, 0))
             steps += 1
             if result.done[0]:
@@ -61,7 +69,7 @@ def test_attempts_equal_a_plain_loop(levels: Level, played: evaluation.FirstEpis
 
 def test_batches_change_no_result(levels: Level, played: evaluation.FirstEpisodes) -> None:
     order = np.random.default_rng(0).permutation(len(IDS))
-    other = play(play_randomly, (), take(levels, order), IDS[order], ATTEMPTS, 1, DEFAULT_RULES, lanes=8)
+    other = play(play_randomly, (), take(levels, order), IDS[order], ATTEMPTS, 1, DEFAULT_RULES, lanes=FEW)
     np.testing.assert_array_equal(other.solved, played.solved[order])
     np.testing.assert_array_equal(other.env_steps, played.env_steps[order])
 
@@ -73,14 +81,14 @@ def test_batches_hold_at_most_their_lanes(
     programs = []
     program_of = evaluation._program
     monkeypatch.setattr(evaluation, "_program", lambda *given: programs.append(given[1]) or program_of(*given))
-    two = play(play_randomly, (), levels, IDS, ATTEMPTS, 1, DEFAULT_RULES, lanes=2)
-    assert programs == [2]
+    two = play(play_randomly, (), levels, IDS, ATTEMPTS, 1, DEFAULT_RULES, lanes=FEW)
+    assert programs == [FEW]
     np.testing.assert_array_equal(two.solved, played.solved)
     np.testing.assert_array_equal(two.env_steps, played.env_steps)
 
 
 def test_more_attempts_keep_the_first_ones(levels: Level, played: evaluation.FirstEpisodes) -> None:
-    more = play(play_randomly, (), levels, IDS, ATTEMPTS + 2, 1, DEFAULT_RULES)
+    more = play(play_randomly, (), levels, IDS, ATTEMPTS + 2, 1, DEFAULT_RULES, lanes=FEW)
     np.testing.assert_array_equal(more.solved[:, :ATTEMPTS], played.solved)
     other = play(play_randomly, (), levels, IDS, ATTEMPTS, 2, DEFAULT_RULES)
     assert (other.env_steps != played.env_steps).any()
@@ -88,15 +96,13 @@ def test_more_attempts_keep_the_first_ones(levels: Level, played: evaluation.Fir
 
 def test_stored_actions_solve_their_level(levels: Level, played: evaluation.FirstEpisodes) -> None:
     """A player that repeats the actions of random play's first attempts solves the same levels, in as many steps."""
-    keys = evaluation._keys(jnp.array(IDS), jnp.uint32(1), jnp.arange(ATTEMPTS))[::ATTEMPTS]
-    draw = lambda key, step: jax.random.uniform(jax.random.fold_in(key, step), (6,))
-    uniform = jax.vmap(jax.vmap(draw, (0, None), -1), (None, 0))(keys, jnp.arange(RECORD_STEPS))
-    actions = np.floor(np.asarray(uniform) * np.array(CHOICES)[:, None]).astype(np.int32)
+    uniform = np.stack([drawn(level_id, 0) for level_id in IDS], -1)
+    actions = np.floor(uniform * np.array(CHOICES)[:, None]).astype(np.int32)
     record = lambda params, moment: params[moment.now.timestep[0]]
-    again = play(record, actions, levels, IDS, 1, 0, DEFAULT_RULES, lanes=len(IDS))
+    played_back = lambda actions: play(record, actions, levels, IDS, 1, 0, DEFAULT_RULES, lanes=len(IDS))
+    again, still = played_back(actions), played_back(np.zeros_like(actions))
     np.testing.assert_array_equal(again.solved[:, 0], played.solved[:, 0])
     np.testing.assert_array_equal(again.env_steps[:, 0], played.env_steps[:, 0])
-    still = play(do_nothing, (), levels, IDS, 1, 0, DEFAULT_RULES)
     assert (again.solved & ~still.solved).any()  # the actions matter
 
 

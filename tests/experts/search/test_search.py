@@ -75,9 +75,9 @@ def test_search_finds_what_random_play_does_not() -> None:
     """In every level the search needs a fraction of its env steps; random play finds almost nothing in as many."""
     assert (found().success.length[SOLVABLE] > 0).all()
     assert (found().env_steps[SOLVABLE] < CONFIG.env_steps).all()
-    both = together(switchback(), valley())
+    twice = take(together(switchback(), valley()), np.array([0, 1, 0, 1]))  # four levels, as where a tower is toppled
     episodes = CONFIG.env_steps // 256 // 256
-    wins = sum(random_play(both, jax.random.key(i)).sum(-1) for i in range(episodes))
+    wins = sum(random_play(twice, jax.random.key(i)).sum(-1) for i in range(episodes // 2))
     np.testing.assert_array_equal(wins, 0)
 
 

@@ -19,7 +19,8 @@ from levelproof.pipeline.words import many
 from tests.pipeline.command import here
 from tests.pipeline.made import lasting, made_job
 
-SETTINGS = ["levels=12", "stop.rule=solved", "executor=inline"]  # so that some use their whole budget
+SHORT = ["search.env_steps=65_536", "search.variations=16_384"]  # limits are in no program
+SETTINGS = ["levels=12", "stop.rule=solved", "executor=inline", *SHORT]  # so that some use their whole budget
 
 
 @pytest.fixture(scope="module")

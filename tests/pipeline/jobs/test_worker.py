@@ -29,7 +29,8 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def job() -> JobConfig:
-    return made_job("data", "budget=5k")
+    # Searches that soon end: their limits are in no program
+    return made_job("data", "budget=5k", "search.env_steps=65_536", "search.variations=16_384")
 
 
 def outcomes(worker: Worker, units: list[WorkUnit]) -> dict[WorkUnit, UnitOutcome]:

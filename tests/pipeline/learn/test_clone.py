@@ -1,6 +1,7 @@
 """Cloning of a policy from a small real split, and continuing after a real kill."""
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -114,8 +115,9 @@ def test_run_that_was_killed_continues_bit_for_bit(split: Path, tmp_path: Path) 
     (tmp_path / "whole").mkdir()
     whole = cloned(tmp_path / "whole", split, *words)
     out = tmp_path / "policy"
-    command = [sys.executable, "-m", "levelproof", "clone", str(split), "-o", str(out), *SETTINGS, *words]
-    killed = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.DEVNULL)
+    command = [sys.executable, "-m", "tests.quick", "clone", str(split), "-o", str(out), *SETTINGS, *words]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    killed = subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL)
     while killed.poll() is None and len(metrics(out) if (out / "metrics.jsonl").exists() else []) < 2:
         time.sleep(0.01)
     killed.send_signal(signal.SIGKILL)
