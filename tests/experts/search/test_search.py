@@ -191,6 +191,7 @@ def test_stopping_limits_need_no_recompilation() -> None:
     assert programs() == before
 
 
+@pytest.mark.campaign
 def test_rounds_between_syncs_change_no_result() -> None:
     same(search(levels(), IDS, replace(CONFIG, rounds=3), DEFAULT_RULES), found())
 
