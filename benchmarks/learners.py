@@ -19,7 +19,7 @@ from levelproof.pipeline.learn.evaluate import ALL, SOLVED
 from levelproof.pipeline.runtime import own_cores
 
 START = "builtin:s"
-OFTEN = "curriculum.every=25", "curriculum.measured_steps=512"  # in a short training
+OFTEN = "curriculum.every=25", "curriculum.measured_steps=512"  # settings for short runs
 WAYS = {  # name: settings of `levelproof train`
     "from scratch": (),
     "from scratch, learnability": ("levels=learnability", *OFTEN),
@@ -98,7 +98,7 @@ def row_of(name: str, trained: dict[str, Any] | None, rates: dict[str, Any], pla
 
 
 def draw(results: Sequence[dict[str, Any]], path: Path) -> None:
-    """Plot the solve rate in training of the ways PLOTTED."""
+    """Plot the training solve rate of the ways in PLOTTED."""
     plt = pyplot()
 
     figure, axes = plt.subplots(figsize=(6, 3.5), layout="constrained")

@@ -8,7 +8,7 @@ from levelproof.experts.networks.over_levels import NetworkConfig
 from levelproof.physics.bounds import require
 
 CURRICULA = ("uniform", "learnability", "replay", "evolve")  # curricula over random levels
-# Groups of settings, and the curricula that read them
+# group of settings: the curricula that read it
 READ_BY = {"curriculum": ("learnability",), "replay": ("replay", "evolve"), "evolve": ("evolve",)}
 
 
@@ -37,6 +37,9 @@ class TrainConfig:
         require(self, ("seed",), 0, 2**31 - 1)
         if not self.levels:
             raise ValueError(f"levels is empty: choose one of {', '.join(CURRICULA)}, a split or level files")
-        children, capacity = self.evolve.children, self.replay.capacity
-        if self.levels == "evolve" and children > capacity:
-            raise ValueError(f"evolve.children is {children}: it must not exceed replay.capacity = {capacity}")
+        room = int((1 - self.replay.full_enough) * self.replay.capacity)
+        if self.levels == "evolve" and self.evolve.children > room:
+            raise ValueError(
+                f"evolve.children is {self.evolve.children}: it must not exceed {room}, the slots of replay.capacity = "
+                f"{self.replay.capacity} that are free when replay starts"
+            )

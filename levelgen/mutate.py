@@ -1,7 +1,7 @@
-"""Random edits: children of levels, for curricula that evolve levels.
+"""Children of levels by random edits, for curricula that evolve levels.
 
-A child is its parent after a few edits of `levelgen.edit`, the editor's, with random arguments. Edits that a level does
-not allow are drawn again; children that cannot be played are left out. Numpy on the host, except for the physics.
+A child is its parent after a few edits of `levelgen.edit`, the editor's, with random arguments. An edit that the level
+does not allow is redrawn; `playable` marks the children that can be played. Numpy on the host, except for the physics.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,13 +29,21 @@ from levelproof.levelgen.edit import (
     set_role,
     turn,
 )
-from levelproof.levelgen.level import ACTIONS, MOTOR_BINDINGS, WORLD_SIDE, Level, Role, concatenate_levels
+from levelproof.levelgen.level import (
+    ACTIONS,
+    MOTOR_BINDINGS,
+    THRUSTER_BINDINGS,
+    WORLD_SIDE,
+    Level,
+    Role,
+    concatenate_levels,
+)
 from levelproof.levelgen.proofs import driven
 from levelproof.levelgen.sampling.scenery import FLOOR_TOP
 from levelproof.levelgen.task.rules import TaskParams, advance, has_nan, reset
 from levelproof.physics.types import FIXED_POLYGONS
 
-MAX_TRIES = 20  # draws of an edit, until a level allows one
+MAX_TRIES = 20  # attempts to draw an edit that the level allows
 STEP = 0.5  # m, standard deviation of a move along either axis
 MAX_FACTOR = 1.5  # by which an edit enlarges or shrinks a body
 MAX_SPEED = 3.0  # m/s after one env step; 99% of sampled levels have no faster body
@@ -50,9 +58,9 @@ def children_of(
 
     Args:
         parents: levels of one size; level axis last.
-        rng: numpy's generator of random numbers, which advances.
-        edits: how many edits part a child from its parent.
-        rules: the rules by which they are played.
+        rng: numpy's generator; advanced.
+        edits: number of edits from parent to child.
+        rules: the task's rules.
     """
     parents = jax.tree.map(np.asarray, parents)
     children = concatenate_levels([child_of(take(parents, np.array([i])), rng, edits) for i in range(len(parents))])
@@ -60,7 +68,7 @@ def children_of(
 
 
 def child_of(parent: Level, rng: np.random.Generator, edits: int) -> Level:
-    """Return a level of one lane after so many random edits."""
+    """Apply random edits to a level of one lane."""
     for _ in range(edits):
         parent = _edited(parent, rng)
     return parent
@@ -77,9 +85,10 @@ def _edited(level: Level, rng: np.random.Generator) -> Level:
 
 @jax.jit(static_argnames="rules")
 def playable(level: Level, rules: TaskParams) -> Bool[Array, " lane"]:
-    """Find levels with a green, a blue and a driven body, all in the room, whose first idle step ends nothing.
+    """Find levels with a green, a blue and a driven body, and the centres of all bodies in the room, that begin calmly:
+    one idle env step neither ends the episode nor leaves a body faster than MAX_SPEED.
 
-    A level whose bodies overlap is not playable: the engine flings them apart.
+    The speed limit excludes most overlaps, since the engine flings overlapping bodies apart.
     """
     model, role = level.model, jnp.where(level.model.active, level.role, Role.PLAIN)
     after, result = advance(level, reset(level), jnp.zeros((ACTIONS, role.shape[-1]), jnp.int32), rules)
@@ -112,6 +121,8 @@ def _resize(level: Level, rng: np.random.Generator) -> Level:
 def _exchange_roles(level: Level, rng: np.random.Generator) -> Level:
     """Exchange the roles of two bodies."""
     a, b = (_body(level, rng) for _ in range(2))
+    if _role(level, a) == _role(level, b):
+        raise EditError("The bodies have equal roles.")
     return set_role(set_role(level, a, _role(level, b)), b, _role(level, a))
 
 
@@ -130,7 +141,7 @@ def _fix(level: Level, rng: np.random.Generator) -> Level:
 
 
 def _join(level: Level, rng: np.random.Generator) -> Level:
-    """Move a body to another one's side, and join the two."""
+    """Move a body next to another, and join them."""
     a, b = (_body(level, rng) for _ in range(2))
     if a == b:
         raise EditError("A joint holds two bodies together.")
@@ -147,7 +158,12 @@ def _add_thruster(level: Level, rng: np.random.Generator) -> Level:
 
 def _bind(level: Level, rng: np.random.Generator) -> Level:
     kind = ("joint", "thruster")[rng.integers(2)]
-    return bind(level, kind, _one_of_kind(level, kind, rng), int(rng.integers(MOTOR_BINDINGS)))
+    bindings, count = {
+        "joint": (level.motor_binding, MOTOR_BINDINGS),
+        "thruster": (level.thruster_binding, THRUSTER_BINDINGS),
+    }[kind]
+    row = _one_of_kind(level, kind, rng)
+    return bind(level, kind, row, int(bindings[row, 0]) + int(rng.integers(1, count)))
 
 
 def _delete(level: Level, rng: np.random.Generator) -> Level:

@@ -94,20 +94,22 @@ class CurriculumConfig:
 class ReplayConfig:
     """Settings of the buffer of levels to replay (hashable: pass as a static argument).
 
-    Those of Jiang et al. 2021 (arXiv:2110.02439) for small levels, but for the temperature: theirs, 0.3, would have
-    most of several hundred lanes replay one level.
+    Values of Jiang et al. 2021 (arXiv:2110.02439) for mazes, except the temperature: at theirs, 0.3, some 60% of all
+    replays would be of one level.
     """
 
-    share: float = 0.5  # share of episodes that replay a level of the buffer, once it is full enough
+    share: float = 0.5  # share of episodes that replay a level, once the buffer is full enough
     capacity: int = 4000  # levels in the buffer
-    full_enough: float = 0.5  # share of the buffer that must be full before levels are replayed
-    temperature: float = 1.0  # chances by score are rank to the power of -1/temperature
-    staleness: float = 0.3  # weight of the updates since a level was last attempted in its chance to be replayed
+    full_enough: float = 0.5  # share of slots with attempted levels from which replay starts
+    temperature: float = 1.0  # the weight of a level's score is its rank to the power of -1/temperature
+    staleness: float = 0.3  # weight of the updates since a level's last episode in its replay probability
 
     def __post_init__(self) -> None:
         require(self, ("share", "full_enough", "staleness"), 0, 1)
         require(self, ("temperature",), 0, above=True)
-        require(self, ("capacity",), 1)
+        require(self, ("capacity",), 1, 2**20)
+        if self.share == 1:
+            raise ValueError("share is 1: set it below 1, or no new level is ever played")
 
 
 @dataclass(frozen=True)
@@ -115,8 +117,8 @@ class EvolveConfig:
     """Settings of the curriculum that edits the levels of the buffer (hashable: pass as a static argument)."""
 
     every: int = 4  # updates between generations
-    children: int = 64  # levels of the buffer that are edited in each
-    edits: int = 2  # random edits that part a child from its parent
+    children: int = 64  # edited copies made per generation
+    edits: int = 2  # random edits from parent to child
 
     def __post_init__(self) -> None:
         require(self, ("every", "children", "edits"), 1)

@@ -1,8 +1,8 @@
-"""Which levels come next: each curriculum is an initial state, a draw, and what it learns of levels meanwhile.
+"""Curricula choose the level of each new episode: an initial state, a draw, and an update from the episodes that ended.
 
-A curriculum sees levels as indices into a table. Random levels have no table but a sampler, and their indices are ids:
-so a curriculum of random levels keeps only ids, however large levels are. `learnability`, `replay` and `evolve` have a
-module each.
+A curriculum sees levels as indices into a table. For random levels the table is a sampler and the index is the level's
+id, so only ids are stored; `evolve` also stores the levels that it edits. `learnability`, `replay` and `evolve` have
+their own modules.
 """
 
 from collections.abc import Callable
@@ -16,36 +16,36 @@ from levelproof.levelgen.sampling.sampler import Sampler
 from levelproof.levelgen.task.lanes import LevelTable, Table
 
 State = Any  # what a curriculum knows, a pytree; () if nothing
-# From levels, env steps and a key to the episodes that end in each level, and how many of them are solved
+# (level indices, env steps, key) -> (episodes that ended in each level, number of them solved)
 Attempt = Callable[[Int[Array, " level"], int, Key[Array, ""]], tuple[Array, Array]]
 
 
 class EndedEpisodes(NamedTuple):
-    """EndedEpisodes of all lanes and cores in one update; of those that are not done, what they are so far."""
+    """Episodes of all lanes and cores in one update, one per env step and lane; the rest counts where `done`."""
 
     done: Bool[Array, " episode"]
     level_index: Int[Array, " episode"]
     gained: Float[Array, " episode"]  # reward
-    value: Float[Array, " episode"]  # mean of the critic's values of its states
+    expected: Float[Array, " episode"]  # reward so far plus the critic's value, mean over its states
 
 
 class Curriculum(NamedTuple):
     """Which levels come next. All functions but `breed` are pure, and all but `draw` get equal arguments on every core.
 
-    Programs are kept by their curriculum: make the same one for equal settings.
+    Compiled programs are cached by curriculum: return the identical object for equal settings.
     """
 
     begin: Callable[[], State]
     draw: Callable[[Table, State, Key[Array, ""], int], Int[Array, " lane"]]  # the next level of each lane
     learn: Callable[[State, EndedEpisodes], State] = lambda state, ended: state  # after every update
-    table: Callable[[Table, State], Table] = lambda table, state: table  # with the levels that the state adds
+    table: Callable[[Table, State], Table] = lambda table, state: table  # adds the levels that the state holds
     every: int = 0  # updates between calls of `measure` or `breed`; 0: never
     measure: Callable[[Table, Attempt, Key[Array, ""]], State] | None = None  # attempts levels
     breed: Callable[[State, np.random.Generator], State] | None = None  # makes levels; runs on the host
 
 
 def fresh(table: Table, key: Key[Array, ""], lanes: int) -> Int[Array, " lane"]:
-    """Draw levels evenly: of a sampler those that are never measured on, of a table any."""
+    """Draw levels uniformly: of a sampler ids below FRESH_IDS, which no policy is measured on; of a table any level."""
     if isinstance(table, Sampler):
         return table.draw_ids(key, (lanes,))
     assert isinstance(table, LevelTable)

@@ -1,8 +1,9 @@
-"""The curriculum that edits levels: ACCEL (Parker-Holder et al. 2022, arXiv:2203.01302), on the buffer of `replay`.
+"""ACCEL (Parker-Holder et al. 2022, arXiv:2203.01302): a curriculum that edits levels of the buffer of `replay`.
 
-Every few updates some levels of the buffer, drawn by their chances, get children: copies after random edits. A child
-takes the slot of a level with a low score and waits there for its first attempt. Of episodes that replay nothing, half
-are in such children, half in fresh random levels; from then on a child is scored like any other level.
+Every few updates, levels drawn by replay probability are copied and edited at random. Each child takes the slot of a
+low-scoring level before its own first attempt; ACCEL evaluates children first. While children wait, half of the
+episodes that do not replay play one of them, the other half a fresh random level. Once attempted, a child is scored
+like any other level.
 """
 
 from functools import cache, partial
@@ -18,11 +19,12 @@ from levelproof.experts.generalist.curricula import Curriculum, fresh
 from levelproof.experts.generalist.replay import (
     ReplayBuffer,
     chance,
+    drawn_from,
     empty,
     learned,
     replayed,
     waiting,
-    with_chances,
+    with_weights,
 )
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.mutate import children_of
@@ -33,16 +35,16 @@ from levelproof.levelgen.task.rules import TaskParams
 
 
 class Population(NamedTuple):
-    """A buffer, and the levels in it that no id gives."""
+    """A buffer with the edited levels in it, which have no id."""
 
     buffer: ReplayBuffer
-    levels: Level  # of slots whose index is FIRST_EXTRA or more; of others anything
+    levels: Level  # valid in slots whose level_index is FIRST_EXTRA or more
     generation: Int[Array, ""]
 
 
 @cache
 def evolve(config: EvolveConfig, buffer: ReplayConfig, sampler: Sampler, rules: TaskParams) -> Curriculum:
-    """Return the curriculum over levels of a sampler, played by these rules."""
+    """Return the curriculum over a sampler's levels and their edited copies."""
     return Curriculum(
         lambda: Population(empty(buffer), empty_level(sampler.size, buffer.capacity), jnp.int32(0)),
         partial(_draw, buffer.share),
@@ -57,8 +59,7 @@ def _draw(share: float, table: Table, now: Population, key: Key[Array, ""], lane
     of_fresh, of_share, of_old, of_half, of_child = jax.random.split(key, 5)
     old, ready = replayed(now.buffer, of_old, lanes)
     count = jnp.cumsum(waiting(now.buffer))
-    number = jax.random.randint(of_child, (lanes,), 0, jnp.maximum(count[-1], 1))
-    child = now.buffer.level_index[jnp.minimum(jnp.searchsorted(count, number, side="right"), len(count) - 1)]
+    child = now.buffer.level_index[drawn_from(count, of_child, lanes)]
     assert isinstance(table, ExtendedTable)
     new = jnp.where(chance(0.5, of_half, lanes) & (count[-1] > 0), child, fresh(table.sampler, of_fresh, lanes))
     return jnp.where(ready & chance(share, of_share, lanes), old, new)
@@ -72,17 +73,18 @@ def _breed(
     now: Population,
     rng: np.random.Generator,
 ) -> Population:
-    """Put a generation of children into the buffer; numpy on the host."""
+    """Add a generation of children to the buffer, in numpy on the host, unless too many of the last one still wait."""
     buffer: ReplayBuffer = jax.tree.map(np.asarray, now.buffer)
     capacity = replaying.capacity
-    if not buffer.cumulative[-1]:
+    room = (1 - replaying.full_enough) * capacity - waiting(buffer).sum()
+    if not buffer.cumulative[-1] or config.children > room:
         return now
-    chances = np.diff(buffer.cumulative.astype(float), prepend=0.0)
-    parents = rng.choice(capacity, config.children, p=chances / chances.sum())
+    weight = np.diff(buffer.cumulative, prepend=0)
+    parents = rng.choice(capacity, config.children, p=weight / weight.sum())
     children, playable = children_of(_levels_of(now, parents, sampler), rng, config.edits, rules)
     born = np.flatnonzero(playable)
     free = np.argsort(np.where(waiting(buffer), np.inf, buffer.score), kind="stable")[: len(born)]
-    # An index of its own for each: an episode that ends late must not score the level that took the slot
+    # A unique index per child, so that a late episode cannot score the level that took over its slot
     names = int(now.generation) % (FIRST_EXTRA // capacity) * capacity + FIRST_EXTRA + free
 
     def put(x: Array, value: Any) -> Array:
@@ -93,7 +95,7 @@ def _breed(
     values = names, -np.inf, -np.inf, 0, buffer.cumulative[free]
     buffer = ReplayBuffer(*(put(x, value) for x, value in zip(buffer, values, strict=True)))
     levels = jax.tree.map(lambda x, child: put(x, child[..., born]), now.levels, children)
-    return Population(with_chances(replaying, buffer), levels, now.generation + 1)
+    return Population(with_weights(replaying, buffer), levels, now.generation + 1)
 
 
 def _levels_of(now: Population, slots: np.ndarray, sampler: Sampler) -> Level:

@@ -23,8 +23,8 @@ class Learnable(NamedTuple):
 def learnability(config: CurriculumConfig) -> Curriculum:
     """Return the curriculum.
 
-    Every now and then the policy attempts fresh levels; those that it solves at a rate p with the largest p(1 - p) are
-    drawn until the next measurement, beside fresh ones.
+    Every `every` updates the policy attempts fresh levels. Those with the largest p(1 - p), where p is their solve
+    rate, are drawn until the next measurement, mixed with fresh levels.
     """
 
     def draw(table: Table, state: Learnable, key: Key[Array, ""], lanes: int) -> Int[Array, " lane"]:

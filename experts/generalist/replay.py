@@ -1,9 +1,9 @@
-"""The curriculum that replays levels: prioritised level replay (Jiang et al. 2021, arXiv:2010.03934 and 2110.02439).
+"""Prioritised level replay (PLR; Jiang et al. 2021, arXiv:2010.03934 and 2110.02439): replays levels of high regret.
 
-A buffer keeps random levels by the regret of their episodes. The score is MaxMC: by how much the highest return that an
-episode of the level ever had exceeds the critic's values, on average over the last episode's states. So a level that
-was solved once, and that the critic does not expect to solve, comes first. Unlike the papers, the policy learns from
-levels that are new, too: half of all samples would otherwise be for nothing.
+A buffer keeps the random levels with the highest scores. The score is MaxMC (second paper): the highest return of a
+level since it entered the buffer, minus what the critic expects, averaged over the states of its latest episodes. What
+it expects of a state is the reward so far plus the state's value, so that rewards for coming nearer cancel out. As in
+the first paper, but not in the second (robust PLR), the policy also learns from new levels.
 """
 
 from functools import cache, partial
@@ -24,15 +24,15 @@ class ReplayBuffer(NamedTuple):
     """Levels that may be replayed."""
 
     level_index: Int[Array, " slot"]
-    score: Float[Array, " slot"]  # mean of the last update with episodes in it; -inf: never attempted
+    score: Float[Array, " slot"]  # mean over the level's episodes in its latest update; -inf: never attempted
     best: Float[Array, " slot"]  # highest return of an episode
     age: Int[Array, " slot"]  # updates since the last episode
-    cumulative: Float[Array, " slot"]  # sums of chances to be replayed, up to 1; 0: the buffer is not full enough
+    cumulative: Int[Array, " slot"]  # sums of replay weights; all 0 until the buffer is full enough
 
 
 @cache
 def replay(config: ReplayConfig) -> Curriculum:
-    """Return the curriculum: with a chance of `share` a level of the buffer, else a fresh one."""
+    """Return the curriculum that replays a level of the buffer with probability `share`, and else draws a fresh one."""
 
     def draw(table: Table, buffer: ReplayBuffer, key: Key[Array, ""], lanes: int) -> Int[Array, " lane"]:
         of_fresh, of_share, of_choice = jax.random.split(key, 3)
@@ -45,7 +45,7 @@ def replay(config: ReplayConfig) -> Curriculum:
 def empty(config: ReplayConfig) -> ReplayBuffer:
     whole = lambda value: jnp.full(config.capacity, value, jnp.int32)
     real = lambda value: jnp.full(config.capacity, value, jnp.float32)
-    return ReplayBuffer(whole(EMPTY), real(-jnp.inf), real(-jnp.inf), whole(0), real(0))
+    return ReplayBuffer(whole(EMPTY), real(-jnp.inf), real(-jnp.inf), whole(0), whole(0))
 
 
 def chance(share: float, key: Key[Array, ""], lanes: int) -> Bool[Array, " lane"]:
@@ -53,33 +53,45 @@ def chance(share: float, key: Key[Array, ""], lanes: int) -> Bool[Array, " lane"
 
 
 def replayed(buffer: ReplayBuffer, key: Key[Array, ""], lanes: int) -> tuple[Int[Array, " lane"], Bool[Array, ""]]:
-    """Draw levels of the buffer by their chances, and tell whether it is full enough."""
-    slot = jnp.searchsorted(buffer.cumulative, jax.random.uniform(key, (lanes,)), side="right")
-    return buffer.level_index[jnp.minimum(slot, len(buffer.cumulative) - 1)], buffer.cumulative[-1] > 0
+    """Draw levels by replay probability; also return whether the buffer is full enough."""
+    return buffer.level_index[drawn_from(buffer.cumulative, key, lanes)], buffer.cumulative[-1] > 0
+
+
+def drawn_from(cumulative: Int[Array, " slot"], key: Key[Array, ""], lanes: int) -> Int[Array, " lane"]:
+    """Draw slots by their weights, whose cumulative sums are given; any slot if all weights are 0."""
+    number = jax.random.randint(key, (lanes,), 0, jnp.maximum(cumulative[-1], 1))
+    return jnp.minimum(jnp.searchsorted(cumulative, number, side="right"), len(cumulative) - 1)
 
 
 def waiting(buffer: ReplayBuffer) -> Bool[Array, " slot"]:
-    """Find levels that were put into the buffer before any attempt."""
+    """Mark the slots whose level has not been attempted."""
     return (buffer.level_index != EMPTY) & (buffer.score == -jnp.inf)
 
 
 def learned(config: ReplayConfig, buffer: ReplayBuffer, ended: EndedEpisodes) -> ReplayBuffer:
-    """Score the levels whose episodes ended; fresh ones take the slots of levels with lower scores."""
+    """Update the scores of levels whose episodes ended; new levels replace those with lower scores."""
     capacity = config.capacity
     order = jnp.argsort(buffer.level_index)
     place = jnp.searchsorted(buffer.level_index[order], ended.level_index)
     at = order[jnp.minimum(place, capacity - 1)]
-    known = ended.done & (buffer.level_index[at] == ended.level_index)
+    done = ended.done & jnp.isfinite(ended.gained - ended.expected)
+    known = done & (buffer.level_index[at] == ended.level_index)
     slot = jnp.where(known, at, capacity)  # beyond the last: dropped
     best = buffer.best.at[slot].max(ended.gained, mode="drop")
     sums = lambda x: jnp.zeros(capacity).at[slot].add(x, mode="drop")
     episodes = sums(1.0)
-    score = jnp.where(episodes > 0, sums(best[at] - ended.value) / jnp.maximum(episodes, 1), buffer.score)
+    score = jnp.where(
+        episodes > 0, sums(jnp.where(known, best[at] - ended.expected, 0)) / jnp.maximum(episodes, 1), buffer.score
+    )
     age = jnp.where(episodes > 0, 0, buffer.age + 1)
 
-    new = ended.done & ~known & (ended.level_index < FIRST_EXTRA)
+    new = done & ~known & (ended.level_index < FIRST_EXTRA)
+    regret = jnp.where(new, ended.gained - ended.expected, -jnp.inf)
+    by_level = jnp.lexsort((-regret, ended.level_index))  # of several episodes of a new level the best enters
+    again = jnp.diff(ended.level_index[by_level], prepend=EMPTY) == 0
+    regret = regret.at[by_level].set(jnp.where(again, -jnp.inf, regret[by_level]))
     count = min(capacity, len(new))
-    regret, which = jax.lax.top_k(jnp.where(new, ended.gained - ended.value, -jnp.inf), count)
+    regret, which = jax.lax.top_k(regret, count)
     kept = jnp.where(waiting(buffer) & (episodes == 0), jnp.inf, score)
     lowest, weakest = jax.lax.top_k(-kept, count)
     enters = regret > -lowest
@@ -92,16 +104,17 @@ def learned(config: ReplayConfig, buffer: ReplayBuffer, ended: EndedEpisodes) ->
         put(age, 0),
         buffer.cumulative,
     )
-    return with_chances(config, after)
+    return with_weights(config, after)
 
 
-def with_chances(config: ReplayConfig, buffer: ReplayBuffer) -> ReplayBuffer:
-    """Compute the chances to be replayed: by the rank of the score, and by age."""
+def with_weights(config: ReplayConfig, buffer: ReplayBuffer) -> ReplayBuffer:
+    """Recompute the replay weights, which are whole numbers with an exact sum, from score ranks and ages."""
     attempted = buffer.score > -jnp.inf
     order = jnp.argsort(-buffer.score)
     rank = jnp.zeros(config.capacity).at[order].set(jnp.arange(1.0, config.capacity + 1))
-    parts = jnp.where(attempted, jnp.stack([rank ** (-1 / config.temperature), buffer.age]), 0.0)
+    ages = jnp.where((buffer.age * attempted).any(), buffer.age, 1)
+    parts = jnp.where(attempted, jnp.stack([rank ** (-1 / config.temperature), ages]), 0.0)
     parts /= jnp.maximum(parts.sum(1, keepdims=True), 1e-9)
-    sums = jnp.cumsum((1 - config.staleness) * parts[0] + config.staleness * parts[1])
+    weight = (2.0**30 * ((1 - config.staleness) * parts[0] + config.staleness * parts[1])).astype(jnp.int32)
     enough = attempted.sum() >= config.full_enough * config.capacity
-    return buffer._replace(cumulative=jnp.where(enough, sums / sums[-1], 0.0))
+    return buffer._replace(cumulative=jnp.where(enough, jnp.cumsum(weight), 0))

@@ -31,7 +31,7 @@ class Playing(NamedTuple):
     state: LaneState
     played: LevelTable  # each lane's level
     gained: Float[Array, " lane"]  # reward so far
-    valued: Float[Array, " lane"]  # sum of the values of the states so far
+    expected: Float[Array, " lane"]  # sum over the states so far of the reward until then plus the value
 
 
 class Ended(NamedTuple):
@@ -41,7 +41,7 @@ class Ended(NamedTuple):
     goal: Bool[Array, "time lane"]
     steps: Int[Array, "time lane"]
     gained: Float[Array, "time lane"]  # reward
-    valued: Float[Array, "time lane"]  # sum of the values of their states
+    expected: Float[Array, "time lane"]  # sum over their states of the reward until then plus the value
     level_index: Int[Array, "time lane"]
 
 
@@ -115,12 +115,12 @@ def rollout(
         log_before = log_probability(logits, action, live)
         coming = draw(of_level, count)
         _, after, _, reward, done, info = lanes.step(table, now.played, now.state, action, coming)
-        gained, valued = now.gained + reward, now.valued + value
-        ended = Ended(done, info["GoalR"], after.now.timestep, gained, valued, info["level_index"])
+        gained, expected = now.gained + reward, now.expected + now.gained + value
+        ended = Ended(done, info["GoalR"], after.now.timestep, gained, expected, info["level_index"])
         restart = lambda ids: lanes.reset(table, ids)[1:]
         state, played = renewed(done, coming, restart, (after, now.played))
         sample_of_step = Experience(observation, live, action, log_before, value, reward, done, info["terminated"])
-        left = (jnp.where(done, 0.0, total) for total in (gained, valued))
+        left = (jnp.where(done, 0.0, total) for total in (gained, expected))
         return Playing(state, played, *left), (sample_of_step, ended)
 
     after, (experience, ended) = jax.lax.scan(act, playing, jnp.arange(steps))

@@ -71,11 +71,11 @@ class TrainingRecipe(NamedTuple):
 
 
 class Programs(NamedTuple):
-    """Functions of a training; they donate the learner."""
+    """Functions of a training; `advance` and a measuring `between_updates` donate the learner."""
 
     begin: Callable[[Table, VariableDict | None], Learner]
     advance: Callable[[Learner, Table, VariableDict | None], tuple[Learner, UpdateFacts]]
-    look_around: Callable[[Learner, Table], Learner]  # every few updates, if the curriculum measures or makes levels
+    between_updates: Callable[[Learner, Table], Learner]  # every `curriculum.every` updates: measure or breed levels
 
 
 class Chunk(NamedTuple):
@@ -176,7 +176,7 @@ def _advance(
 
 
 def _of_all_cores(ended: Ended) -> EndedEpisodes:
-    mine = EndedEpisodes(ended.done, ended.level_index, ended.gained, ended.valued / ended.steps)
+    mine = EndedEpisodes(ended.done, ended.level_index, ended.gained, ended.expected / ended.steps)
     return jax.tree.map(lambda x: jax.lax.all_gather(x.reshape(-1), CORES, tiled=True), mine)
 
 
@@ -313,7 +313,7 @@ def _measure(recipe: TrainingRecipe, learner: Learner, table: Table) -> Learner:
 
 
 def _breed(recipe: TrainingRecipe, everywhere: NamedSharding, learner: Learner, table: Table) -> Learner:
-    """Have the curriculum make levels, on the host."""
+    """Let the curriculum breed levels on the host."""
     assert recipe.curriculum.breed
     rng = np.random.default_rng((recipe.seed, BREEDING, int(learner.updates)))
     return learner._replace(curriculum=jax.device_put(recipe.curriculum.breed(learner.curriculum, rng), everywhere))

@@ -30,7 +30,7 @@ from levelproof.physics.lanes import Ref
 from levelproof.physics.types import FIXED_POLYGONS, Size
 
 CHUNK = 256  # levels per call of the compiled program, which is padded to this
-FRESH_IDS = 1 << FRESH_BITS  # ids of fresh levels are below, those that policies are measured on above
+FRESH_IDS = 1 << FRESH_BITS  # fresh levels have lower ids; the levels that policies are measured on have higher ones
 DEFAULT = Distribution()
 
 

@@ -109,8 +109,8 @@ def _let_groups_collide(group: Readable, collides: Ref) -> None:
 def collision_matrix(model: Model) -> Bool[Array, "body body lane"]:
     """Find which bodies may collide: those that no chain of active joints holds together.
 
-    Transitive closure by repeated squaring: each pass doubles the length of the chains that `joined` covers. Of numpy
-    arrays, numpy computes it, which takes a tenth of the time for one level.
+    Transitive closure by repeated squaring: each pass doubles the length of the chains that `joined` covers. Numpy
+    inputs are computed in numpy, which takes a tenth of the time for one level.
     """
     body = np.arange(model.size.bodies)[:, None]
     ends = [(index[:, None] == body) & model.joint_active[:, None] for index in (model.joint_a, model.joint_b)]

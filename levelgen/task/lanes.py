@@ -39,10 +39,10 @@ class LevelTable:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class ExtendedTable:
-    """Random levels by id, and extra ones, which may change while lanes play.
+    """Random levels by id, plus extra levels that may change while lanes play.
 
-    Index i < FIRST_EXTRA is the random level with this id; FIRST_EXTRA + i is column i % len(levels) of `levels`. So
-    levels that follow one another in a column can have an index each.
+    An index below FIRST_EXTRA is a level id; FIRST_EXTRA + i is column i % len(levels) of `levels`, so successive
+    levels of one column can have distinct indices.
     """
 
     sampler: Sampler
@@ -62,7 +62,7 @@ class LaneState:
     level_index: Int[Array, " lane"]  # into the table
 
 
-FIRST_EXTRA = FRESH_IDS  # ids of random levels are below
+FIRST_EXTRA = FRESH_IDS  # first index that is not a level id
 Table = LevelTable | Sampler | ExtendedTable
 LaneStep = tuple[Any, LaneState, LevelTable, Float[Array, " lane"], Bool[Array, " lane"], dict[str, Any]]
 
@@ -117,7 +117,7 @@ class Lanes:
             state: the episodes under way.
             action: actions of the environment's type, lanes last: int [lane], int [6, lane] or float [6, lane].
             next_index: index in the table of the level that a lane starts if this step ends its episode; for a
-                Sampler, the level's id.
+                Sampler, the level's id; ExtendedTable says what it is there.
 
         `info` has the entries of `Environment.step`, lanes last. No gradient flows through the world.
         """

@@ -132,7 +132,7 @@ def recipe_of(config: TrainConfig, source: TrainingLevels, start: Policy | None,
 
 
 def curriculum_of(config: TrainConfig, levels: Level | Sampler, rules: TaskParams) -> Curriculum:
-    """Return the curriculum that the settings name; levels of a split or of files are drawn evenly."""
+    """Return the curriculum named by `levels`; levels of a split or of files are drawn uniformly."""
     if config.levels == "learnability":
         return learnability(config.curriculum)
     if config.levels == "replay":
@@ -173,7 +173,7 @@ def update_until_done(
     with shown(console, "compiling", last, first) as show:
         for update in range(first + 1, last + 1):
             if every and (update - 1) % every == 0:
-                learner = programs.look_around(learner, table)
+                learner = programs.between_updates(learner, table)
             learner, facts = programs.advance(learner, table, start)
             recent.append(jax.device_get(facts))
             if update == first + 1:

@@ -1,4 +1,4 @@
-"""Curricula that replay and edit levels: scores, chances, who gives way, and children that wait for an attempt."""
+"""Curricula that replay and edit levels: scores, chances, eviction, and children that wait for an attempt."""
 
 import jax
 import jax.numpy as jnp
@@ -9,17 +9,18 @@ from levelproof import make
 from levelproof.experts.generalist.config import EvolveConfig, ReplayConfig
 from levelproof.experts.generalist.curricula import EndedEpisodes, fresh
 from levelproof.experts.generalist.evolve import Population, evolve
-from levelproof.experts.generalist.replay import ReplayBuffer, empty, learned, replay, waiting
+from levelproof.experts.generalist.replay import ReplayBuffer, empty, learned, replay, waiting, with_weights
 from levelproof.levelgen.sampling.sampler import sample_levels, sampler
 from levelproof.levelgen.task.lanes import FIRST_EXTRA, ExtendedTable, Lanes
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 
 CONFIG = ReplayConfig(capacity=4, full_enough=0.5, staleness=0.0)
+STALE = ReplayConfig(capacity=4, full_enough=0.5, staleness=1.0, share=0.99)
 KEY = jax.random.key(0)
 
 
 def episodes(*ended: tuple[int, float, float], going: int = 0) -> EndedEpisodes:
-    """Return episodes as (level, return, mean value), the last `going` of them under way."""
+    """Return episodes as (level, return, what the critic expected), the last `going` of them under way."""
     level, gained, value = (jnp.array(column) for column in zip(*ended, strict=True))
     return EndedEpisodes(jnp.arange(len(level)) < len(level) - going, level, gained * 1.0, value * 1.0)
 
@@ -33,7 +34,7 @@ def test_levels_with_the_highest_regret_stay() -> None:
     buffer = learned(CONFIG, empty(CONFIG), episodes((10, 1, 0.9), (11, 1, 0.5), (12, 0, 0.2), (99, 1, 0), going=1))
     assert scores(buffer) == pytest.approx({10: 0.1, 11: 0.5, 12: -0.2})
     buffer = learned(CONFIG, buffer, episodes((13, 1, 0.7), (14, 1, 0.2), (15, 0, 0.9)))
-    assert scores(buffer) == pytest.approx({10: 0.1, 11: 0.5, 13: 0.3, 14: 0.8}), "12 gives way, and 15 stays out"
+    assert scores(buffer) == pytest.approx({10: 0.1, 11: 0.5, 13: 0.3, 14: 0.8}), "15 is rejected, and 12 is evicted"
 
 
 def test_score_is_the_highest_return_minus_the_mean_value() -> None:
@@ -58,18 +59,46 @@ def test_chances_follow_ranks_and_ages() -> None:
     expected = {11: 0.5 / sum_of_ranks, 12: 0.5 / 2 / sum_of_ranks, 10: 0.5 / 3 / sum_of_ranks}
     assert share == pytest.approx(expected, abs=0.015)
 
-    stale = ReplayConfig(capacity=4, full_enough=0.5, staleness=1.0, share=1.0)
-    buffer = learned(stale, empty(stale), first)
-    buffer = learned(stale, learned(stale, buffer, episodes((11, 1, 0.5))), episodes((10, 1, 0.5)))
-    drawn = np.asarray(replay(stale).draw(table, buffer, KEY, draws))
+    buffer = learned(STALE, empty(STALE), first)
+    buffer = learned(STALE, learned(STALE, buffer, episodes((11, 1, 0.5))), episodes((10, 1, 0.5)))
+    drawn = np.asarray(replay(STALE).draw(table, buffer, KEY, draws))
     ages = {10: 0, 11: 1, 12: 2}
     assert {level: (drawn == level).mean() for level in ages} == pytest.approx(
-        {level: age / 3 for level, age in ages.items()}, abs=0.015
+        {level: 0.99 * age / 3 for level, age in ages.items()}, abs=0.015
     )
 
 
 EVOLVING = ReplayConfig(capacity=32)
 EVOLVE = evolve(EvolveConfig(children=16), EVOLVING, sampler("s"), DEFAULT_RULES)
+
+
+@pytest.mark.parametrize("temperature", [0.1, 1.0])
+def test_levels_without_an_attempt_are_never_replayed(temperature: float) -> None:
+    """Their weight is exactly 0, however floats round; with all ages equal staleness counts for all alike."""
+    config = ReplayConfig(capacity=500, full_enough=0.0, temperature=temperature)
+    rng = np.random.default_rng(0)
+    for attempted in (0, 1, 250, 499, 500):
+        score = np.full(500, -np.inf, np.float32)
+        score[rng.choice(500, attempted, replace=False)] = rng.normal(size=attempted)
+        buffer = empty(config)._replace(score=jnp.asarray(score), age=jnp.asarray(rng.integers(0, 9, 500)))
+        weight = np.diff(np.asarray(with_weights(config, buffer).cumulative), prepend=0)
+        assert (weight >= 0).all()
+        assert not weight[score == -np.inf].any()
+        assert weight.any() == (attempted > 0)
+    ageless = learned(STALE, empty(STALE), episodes((10, 1, 0.9), (11, 1, 0.5)))
+    assert np.diff(np.asarray(ageless.cumulative), prepend=0).tolist() == [2**29, 2**29, 0, 0]
+
+
+def test_several_episodes_of_a_new_level_fill_one_slot() -> None:
+    buffer = learned(CONFIG, empty(CONFIG), episodes((50, 1, 0.75), (7, 1, 0.5), (50, 1, 0.25)))
+    assert np.asarray(buffer.level_index).tolist().count(50) == 1
+    assert scores(buffer) == pytest.approx({50: 0.75, 7: 0.5})
+
+
+def test_broken_values_enter_no_score() -> None:
+    buffer = learned(CONFIG, empty(CONFIG), episodes((10, 1, 0.5), (11, 1, np.nan)))
+    assert scores(buffer) == pytest.approx({10: 0.5})
+    assert scores(learned(CONFIG, buffer, episodes((10, 1, np.nan)))) == pytest.approx({10: 0.5})
 
 
 def bred() -> tuple[Population, Population]:
@@ -89,10 +118,10 @@ def test_children_take_the_slots_of_low_scores_and_wait() -> None:
     assert (names >= FIRST_EXTRA).all()
     assert np.array_equal((names - FIRST_EXTRA) % 32, np.flatnonzero(new))
     crowd = learned(EVOLVING, after.buffer, episodes(*((1000 + level, 1, -1) for level in range(40))))
-    assert set(names.tolist()) <= set(np.asarray(crowd.level_index).tolist()), "who waits does not give way"
+    assert set(names.tolist()) <= set(np.asarray(crowd.level_index).tolist()), "waiting children are not evicted"
 
 
-def test_half_of_what_is_not_replayed_are_children_that_wait() -> None:
+def test_half_of_unreplayed_episodes_play_waiting_children() -> None:
     _, after = bred()
     drawn = np.asarray(EVOLVE.draw(EVOLVE.table(sampler("s"), after), after, KEY, 20_000))
     known, new = (np.asarray(after.buffer.level_index)[x] for x in (~waiting(after.buffer), waiting(after.buffer)))

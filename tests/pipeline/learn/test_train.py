@@ -164,9 +164,9 @@ def test_random_levels_are_measured_for_learnability(tmp_path: Path) -> None:
 
 @pytest.mark.campaign
 def test_random_levels_are_replayed(tmp_path: Path) -> None:
-    out = trained(tmp_path, 6, "levels=replay", "replay.capacity=8", *TINY)
+    out = trained(tmp_path, 6, "levels=replay", "replay.capacity=8", "replay.full_enough=1", *TINY)
     kept = {name: x for name, x in load_file(out / "checkpoint.safetensors").items() if name.startswith(".curriculum")}
-    assert kept[".curriculum.cumulative"][-1] == 1
+    assert kept[".curriculum.cumulative"][-1] > 0
     assert np.isfinite(kept[".curriculum.score"]).all()
 
 
@@ -195,8 +195,9 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (["size=s", "levels=some/split"], "size has no effect"),
         (["where=label = 'solved'"], "where has no effect on random levels"),
         (["curriculum.keep=4"], "no effect with levels=uniform"),
+        (["levels=replay", "replay.share=1"], "share is 1"),
         (["levels=replay", "evolve.edits=4"], "no effect with levels=replay"),
-        (["levels=evolve", "replay.capacity=4"], "evolve.children is 64: it must not exceed replay.capacity = 4"),
+        (["levels=evolve", "replay.capacity=4"], "evolve.children is 64: it must not exceed 2"),
         (["ppo.kl_weight=1"], "no effect without start"),
         (["start=policy", "network.width=8"], "network.width is that of the policy to start from"),
         (["distribution=kinetx"], "did you mean kinetix?"),
