@@ -15,7 +15,7 @@ from jaxtyping import Array, Int
 from levelproof.experts.ledger import Ledger
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.quick import jit_quickly
+from levelproof.levelgen.programs import jit_quickly
 
 Rows = Any  # state of slots: a dataclass, its `levels` with the slot axis last, all else slot-first
 

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 from jax._src import compiler
 
-from levelproof.levelgen.quick import UNOPTIMISED
+from levelproof.levelgen.programs import UNOPTIMISED
 
 FAST_COMPILING = "jax_disable_most_optimizations"  # a setting of JAX
 # XLA's older code for fusions takes LLVM half as long as what replaces it. JAX has no setting for such options, and the

@@ -21,13 +21,14 @@ from levelproof.experts.witness.success import no_success
 from levelproof.experts.witness.witness import replay_block
 from levelproof.levelgen.batching import LANES, at_once
 from levelproof.levelgen.level import ACTIONS, Level
+from levelproof.levelgen.programs import TRACING, StoredProgram
 from levelproof.levelgen.proofs import examine
 from levelproof.physics.buffers import buffers_of
 from levelproof.physics.types import Size
 
 
 class Program(NamedTuple):
-    """A jitted function, and the shapes and settings of a call; once compiled for these, the call compiles nothing."""
+    """A function, and the shapes and settings of a call; once compiled for these, the call compiles nothing."""
 
     function: Any
     call: Callable[[], tuple[tuple[Any, ...], dict[str, Any]]]  # makes the positional and named arguments
@@ -37,10 +38,15 @@ class Program(NamedTuple):
     def name(self) -> str:
         return f"{self.function.__module__}.{self.function.__name__} {self.stage}".rstrip()
 
-    def lower(self) -> Any:
-        """Trace and lower; the result's `compile()` compiles for this process and others with the same cache folder."""
+    def prepare(self) -> None:
+        """Load or compile it, for this process and others with the same cache folder."""
         arguments, settings = self.call()
-        return self.function.lower(*arguments, **settings)
+        if isinstance(self.function, StoredProgram):
+            self.function.prepare(*arguments, **settings)
+        else:
+            with TRACING:
+                lowered = self.function.lower(*arguments, **settings)
+            lowered.compile()
 
 
 def programs_of(pool: Pool, size: Size) -> list[Program]:

@@ -19,7 +19,7 @@ from levelproof.experts.verdict.portability import moved, survivors
 from levelproof.experts.witness.success import Success
 from levelproof.levelgen.batching import repeat
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.quick import jit_quickly
+from levelproof.levelgen.programs import jit_quickly
 from levelproof.levelgen.task.rules import TaskParams
 
 LANES = 64  # per level; the first plays the witness itself, the others variations

@@ -19,6 +19,7 @@ from levelproof.experts.search.play import CODES, Arena, Walk, arena, best_lane,
 from levelproof.experts.search.rows import from_rows, to_rows
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import ACTIONS, Level
+from levelproof.levelgen.programs import jit_stored
 from levelproof.levelgen.task.rules import TaskParams
 
 NEARER = 0.98  # the gap must shrink to this share of the smallest so far to count as progress
@@ -49,7 +50,7 @@ class RoundDraws(NamedTuple):
     bits: UInt32[Array, "segment time 6 lane"]  # bits for the actions that follow
 
 
-@partial(jax.jit, static_argnames=("config", "rules"))
+@jit_stored(static_argnames=("config", "rules"))
 def begin(levels: Level, level_ids: Int[Array, " level"], config: SearchConfig, rules: TaskParams) -> Search:
     """Start a search: archives contain the levels' first states alone.
 
@@ -78,7 +79,7 @@ def explore(search: Search, config: SearchConfig, rules: TaskParams) -> Search:
     return explore_rounds(search, config.ends, config.endless, rules)
 
 
-@partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="search")
+@jit_stored(static_argnames=("config", "rules"), donate_argnames="search")
 def explore_rounds(search: Search, ends: StopLimits, config: SearchConfig, rules: TaskParams) -> Search:
     ring = arena(search.levels, config.lanes, config.resample)
     step = lambda search, _: (explore_round(search, ring, ends, config, rules), None)

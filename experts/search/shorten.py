@@ -18,7 +18,7 @@ from levelproof.experts.search.edit import Draws, draw, edits, shortening, varia
 from levelproof.experts.search.play import Arena, Walk, act, arena, best_lane, code_of, decode, fresh_walk, success_of
 from levelproof.experts.witness.success import Success
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.quick import jit_quickly
+from levelproof.levelgen.programs import jit_quickly
 from levelproof.levelgen.task.measures import goal_distance
 from levelproof.levelgen.task.rules import TaskParams
 

@@ -7,7 +7,6 @@ a variation keeps the actions after a change, so it can correct an aim.
 """
 
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -22,7 +21,7 @@ from levelproof.experts.search.near import FAR, gap
 from levelproof.experts.search.play import CODES, Arena, Walk, act, arena, decode, fresh_walk, most_steps
 from levelproof.experts.search.rows import from_rows, to_rows
 from levelproof.levelgen.level import ACTIONS, Level
-from levelproof.levelgen.quick import jit_quickly
+from levelproof.levelgen.programs import jit_quickly, jit_stored
 from levelproof.levelgen.task.rules import TaskParams
 
 KEPT = 8  # trajectories per level
@@ -108,7 +107,7 @@ def vary(varying: Varying, config: SearchConfig, rules: TaskParams) -> Varying:
     return vary_rounds(varying, config.ends, config.endless, rules)
 
 
-@partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="varying")
+@jit_stored(static_argnames=("config", "rules"), donate_argnames="varying")
 def vary_rounds(varying: Varying, ends: StopLimits, config: SearchConfig, rules: TaskParams) -> Varying:
     ring = arena(varying.levels, config.lanes, (1.0,))
     step = lambda varying, _: (vary_round(varying, ring, ends, config, rules), None)

@@ -27,6 +27,7 @@ from levelproof.experts.witness.success import find, remember
 from levelproof.levelgen.batching import repeat
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import Level
+from levelproof.levelgen.programs import jit_stored
 from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.rules import TaskParams
 
@@ -41,7 +42,7 @@ def over_slots(function: Callable, *slots: Any) -> Any:
     return jax.vmap(function)(*slots)
 
 
-@partial(jax.jit, static_argnames=("config", "rules"), donate_argnames="slots")
+@jit_stored(static_argnames=("config", "rules"), donate_argnames="slots")
 def advance(slots: Slots, config: ExpertConfig, stopping: StopRules, rules: TaskParams) -> tuple[Slots, Report]:
     """Roll out every slot, then update its expert or record a part of its evaluation.
 

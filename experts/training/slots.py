@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -22,7 +21,7 @@ from levelproof.experts.witness.success import Success
 from levelproof.levelgen.batching import repeat
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.quick import jit_quickly
+from levelproof.levelgen.programs import jit_quickly, jit_stored
 from levelproof.levelgen.task.actions import CHOICES
 
 
@@ -123,7 +122,7 @@ class Report(NamedTuple):
     early: Bool[Array, " slot"]  # the level left solved, before its final evaluation
 
 
-@partial(jax.jit, static_argnames="config")
+@jit_stored(static_argnames="config")
 def begin(levels: Level, level_ids: Int[Array, " level"], success: Success, config: ExpertConfig) -> ExpertState:
     """Initialise experts, level axis first; they know nothing but the success, if there is one."""
     network, lanes = network_of(levels.size, config), config.environments

@@ -18,7 +18,7 @@ from levelproof.experts.verdict.judge import Witness
 from levelproof.levelgen.batching import at_once, block_size, blocks, take
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.quick import jit_quickly
+from levelproof.levelgen.programs import jit_quickly
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.types import State
 

@@ -2,6 +2,7 @@
 
 import ctypes
 import hashlib
+import re
 import threading
 from collections.abc import Sequence
 from functools import cache
@@ -18,7 +19,9 @@ from levelproof.physics.codegen.lower import Memory, lower
 from levelproof.physics.codegen.values import INDEX
 
 COMPILING = threading.RLock()  # held while a kernel is compiled: LLVM and XLA accept a name only once in a process
+NAME = "levelproof_"  # prefix of kernels' names, which XLA knows
 _libraries: dict[str, binding.ResourceTracker] = {}  # machine code must outlive every executable that calls it
+_texts: dict[str, str] = {}
 
 
 def write(
@@ -44,15 +47,20 @@ def write(
 
 def register(text: str) -> str:
     """Compile the text from `write` and register it with XLA; return its name for `jax.ffi.ffi_call`."""
-    name = "levelproof_" + hashlib.sha256(text.encode()).hexdigest()[:16]
+    name = NAME + hashlib.sha256(text.encode()).hexdigest()[:16]
     with COMPILING:
         if name not in _libraries:
             builder = binding.JITLibraryBuilder().add_object_img(_object_code(text))
             library = builder.export_symbol("handler").link(_jit(), name)
             handler = jax.ffi.pycapsule(ctypes.c_void_p(library["handler"]))
             jax.ffi.register_ffi_target(name, handler, platform="cpu")
-            _libraries[name] = library
+            _libraries[name], _texts[name] = library, text
     return name
+
+
+def texts_in(program: str) -> list[str]:
+    """Return the texts of the registered kernels that a program's text names; `register` takes them."""
+    return [_texts[name] for name in sorted(set(re.findall(rf"{NAME}[0-9a-f]{{16}}", program)))]
 
 
 def _block(module: ir.Module, jaxpr: core.ClosedJaxpr, buffers: Sequence[Buffer], outside: int) -> ir.Function:

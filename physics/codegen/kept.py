@@ -1,8 +1,9 @@
-"""A disk cache of kernels, beside JAX's compiled programs: tracing one takes half a second, optimising it seconds."""
+"""A disk cache of kernels and of programs with them, beside JAX's own, which has to trace a program to find it."""
 
 import hashlib
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -23,19 +24,8 @@ def cached(key: str, make: Callable[[], bytes]) -> bytes:
 
     Files lie in JAX's compilation cache, if there is one; a folder that cannot be read or written costs only time.
     """
-    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    if not folder or not jax.config.jax_enable_compilation_cache:  # pyright: ignore[reportAttributeAccessIssue]
-        return make()
-    file = Path(folder) / f"levelproof-{hashlib.sha256(key.encode()).hexdigest()}.kernel"
-    with suppress(OSError):
-        stored = file.read_bytes()
-        if hashlib.sha256(stored[DIGEST:]).digest() == stored[:DIGEST]:
-            return stored[DIGEST:]
-    code = make()
-    with suppress(OSError):
-        unfinished = file.with_name(f".{file.name}.{os.getpid()}")
-        unfinished.write_bytes(hashlib.sha256(code).digest() + code)
-        unfinished.replace(file)
+    if (code := stored(key)) is None:
+        store(key, code := make())
     return code
 
 
@@ -45,12 +35,54 @@ def cached_by_sources(request: str, make: Callable[[], bytes], folders: Sequence
     `folders` hold the sources. If one has changed since this process began, call `make`: which version this process
     imported is unknown.
     """
+    key = key_by_sources(request, folders)
+    return make() if key is None else cached(key, make)
+
+
+def key_by_sources(request: str, folders: Sequence[Path]) -> str | None:
+    """Return the key of `request`, these sources and the library versions; None if a source has changed meanwhile."""
     digests, changes = zip(*map(_sources, folders), strict=True)
     if max(changes) >= BEGAN:
-        return make()
+        return None
     x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
     versions = [sys.version, jax.__version__, np.__version__, llvmlite.__version__]
-    return cached("\n".join([*digests, *versions, binding.get_default_triple(), str(x64), request]), make)
+    return "\n".join([*digests, *versions, binding.get_default_triple(), str(x64), request])
+
+
+def cache_is_on() -> bool:
+    """Return whether there is a folder to keep code in."""
+    return bool(_folder())
+
+
+def stored(key: str) -> bytes | None:
+    """Return what `store` kept for a key, or None."""
+    if not (folder := _folder()):
+        return None
+    with suppress(OSError):
+        found = _file(folder, key).read_bytes()
+        if hashlib.sha256(found[DIGEST:]).digest() == found[:DIGEST]:
+            return found[DIGEST:]
+    return None
+
+
+def store(key: str, code: bytes) -> None:
+    """Keep code for a key, whole or not at all, if there is a folder."""
+    if not (folder := _folder()):
+        return
+    file = _file(folder, key)
+    with suppress(OSError):
+        unfinished = file.with_name(f".{file.name}.{os.getpid()}.{threading.get_ident()}")
+        unfinished.write_bytes(hashlib.sha256(code).digest() + code)
+        unfinished.replace(file)
+
+
+def _folder() -> str | None:
+    on = jax.config.jax_enable_compilation_cache  # pyright: ignore[reportAttributeAccessIssue]
+    return jax.config.jax_compilation_cache_dir if on else None  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _file(folder: str, key: str) -> Path:
+    return Path(folder) / f"levelproof-{hashlib.sha256(key.encode()).hexdigest()}.kernel"
 
 
 @cache

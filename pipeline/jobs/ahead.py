@@ -4,7 +4,6 @@ import hashlib
 import time
 from contextlib import suppress
 from pathlib import Path
-from threading import Lock
 
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.pool.pool import Pool
@@ -31,7 +30,6 @@ class Ahead:
         of_code = [entry for entry in program_of(job).items() if entry[0] != "configuration"]
         settings = job.size, job.expert, search.endless, search.robustness, job.task, of_code, device()
         self._seconds: list[float] = []  # time of each program that this process has compiled
-        self._tracing = Lock()  # Python's part of compiling gains nothing from threads, and shares what it caches
         self._programs = {_claim(folder, program, repr(settings)): program for program in programs}
 
     def compile_next(self) -> tuple[int, int] | None:
@@ -51,10 +49,8 @@ class Ahead:
         return None
 
     def _compile(self, program: Program) -> None:
-        with self._tracing:
-            begun = time.perf_counter()
-            lowered = program.lower()
-        lowered.compile()
+        begun = time.perf_counter()
+        program.prepare()
         self._seconds.append(time.perf_counter() - begun)
 
     @property

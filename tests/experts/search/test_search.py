@@ -181,7 +181,7 @@ def test_level_with_few_cells_leaves_at_a_rung() -> None:
 
 def test_stopping_limits_need_no_recompilation() -> None:
     """Other env steps, rungs or patience need no compiling."""
-    programs = lambda: explore_rounds._cache_size()  # pyright: ignore[reportAttributeAccessIssue]
+    programs = explore_rounds.count
     explore(begun(), CONFIG, DEFAULT_RULES)
     before = programs()
     given = {"env_steps": 5000, "variations": 7000, "patience": 300, "per_cell": 9, "first_rung": 2048, "bodies": 30}

@@ -99,10 +99,10 @@ def test_level_trains_then_is_evaluated_then_leaves(levels: Level) -> None:
 def test_advance_is_compiled_once(levels: Level) -> None:
     """Other numbers of levels, budgets and rules share the program."""
     train(take(levels, np.arange(3)), IDS[:3], 2, CONFIG, SOLVED)
-    before = advance._cache_size()
+    before = advance.count()
     for stopping in (SOLVED, WHOLE, HALVED):
         train(levels, IDS, 3, CONFIG, stopping)
-    assert advance._cache_size() == before
+    assert advance.count() == before
 
 
 def test_hopeless_levels_leave_at_a_rung(levels: Level, whole: list[TrainedLevel]) -> None:

@@ -1,0 +1,184 @@
+"""Programs that processes share: one makes them, the others load them without tracing the function.
+
+JAX's own cache is found by the traced program, and tracing takes longer than loading. Here a program is found by the
+function's name, its static arguments, the shapes of the others, all sources, versions and settings of JAX.
+"""
+
+import inspect
+import os
+import pickle
+import threading
+import time
+import zlib
+from collections.abc import Callable
+from contextlib import suppress
+from functools import cache, cached_property, partial, update_wrapper
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import jax
+from jax import monitoring
+from jax.core import Tracer
+from jax.experimental import serialize_executable
+from llvmlite import binding
+
+from levelproof.physics.codegen.compile import register, texts_in
+from levelproof.physics.codegen.kept import cache_is_on, key_by_sources, store, stored
+
+UNOPTIMISED = {"xla_backend_optimization_level": 0}
+SOURCES = [Path(__file__).parents[1] / room for room in ("physics", "levelgen", "experts")]
+LOADED = "/jax/core/compile/levelproof_load"  # event that counts as compiling, as JAX's own do
+TRACING = threading.Lock()  # Python's part of compiling gains nothing from threads, and shares what it caches
+T = TypeVar("T")
+
+
+class Call(NamedTuple):
+    """What decides a program: static arguments, and the types of the others."""
+
+    static: tuple[Any, ...]
+    tree: Any
+    types: tuple[Any, ...]
+    settings: tuple[Any, ...]  # of JAX, those that a process may change between calls
+
+
+class StoredProgram(Generic[T]):
+    """A jitted function, whose programs are stored beside JAX's compiled ones.
+
+    Called within `jax.jit`, on a GPU, on several devices or without a folder for the cache, it is `jax.jit` alone.
+    """
+
+    def __init__(self, function: Callable[..., T], optimise: bool = True, **settings: Any) -> None:
+        self.function, self.optimise, self._settings = function, optimise, settings
+        self._signature, self._programs = inspect.signature(function), dict[Call, Any]()
+        names = settings.get("static_argnames", ())
+        self._static = {names} if isinstance(names, str) else set(names)
+        update_wrapper(self, function)
+
+    @cached_property
+    def program(self) -> Any:
+        """The jitted function; made on first use, because `jax.default_backend` starts the backend."""
+        quick = not self.optimise and jax.default_backend() == "cpu"
+        return jax.jit(self.function, compiler_options=UNOPTIMISED if quick else None, **self._settings)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> T:
+        given, call = self._call(args, kwargs)
+        if call is None:
+            return self.program(*args, **kwargs)
+        return self._ready(call, args, kwargs)(*given)
+
+    def prepare(self, *args: Any, **kwargs: Any) -> None:
+        """Load or compile the program for a call with these arguments, which may be shapes."""
+        _, call = self._call(args, kwargs)
+        if call is None:
+            with TRACING:
+                lowered = self.program.lower(*args, **kwargs)
+            lowered.compile()
+        else:
+            self._ready(call, args, kwargs)
+
+    def eval_shape(self, *args: Any, **kwargs: Any) -> Any:
+        """Return the shapes of the results; arguments may be shapes."""
+        return self.program.eval_shape(*args, **kwargs)
+
+    def lower(self, *args: Any, **kwargs: Any) -> Any:
+        """Lower as `jax.jit` does: arguments may be shapes."""
+        return self.program.lower(*args, **kwargs)
+
+    def count(self) -> int:
+        """Return how many programs this process has made or loaded."""
+        return len(self._programs) or self.program._cache_size()
+
+    def _call(self, args: Any, kwargs: Any) -> tuple[list[Any], Call | None]:
+        """Return the arguments that are not static, and what decides the program; None: leave it to `jax.jit`."""
+        bound = self._signature.bind(*args, **kwargs)
+        bound.apply_defaults()
+        static = tuple(value for name, value in bound.arguments.items() if name in self._static)
+        given = [value for name, value in bound.arguments.items() if name not in self._static]
+        leaves, tree = jax.tree.flatten(given)
+        if any(isinstance(x, Tracer) for x in leaves) or not _alone() or not cache_is_on():
+            return given, None
+        return given, Call(static, tree, tuple(map(_type_of, leaves)), _settings())
+
+    def _ready(self, call: Call, args: Any, kwargs: Any) -> Any:
+        """Return the program of a call, from this process, from the disk, or made now."""
+        if (program := self._programs.get(call)) is None:
+            name = f"{self.function.__module__}.{self.function.__qualname__}"
+            request = f"{name} {self.optimise} {self._settings} {call} {_machine()}"
+            # An object without a text of its own has its address, which means nothing to another process
+            key = None if " at 0x" in request else key_by_sources(request, SOURCES)
+            program = (key and _load(key, call)) or self._make(key, args, kwargs)
+            self._programs[call] = program
+        return program
+
+    def _make(self, key: str | None, args: Any, kwargs: Any) -> Any:
+        bound = self._signature.bind(*args, **kwargs)
+        bound.apply_defaults()
+        with TRACING:
+            lowered = self.program.lower(*bound.args, **bound.kwargs)
+        compiled = lowered.compile()
+        if key:
+            with suppress(ValueError, NotImplementedError, pickle.PicklingError):  # JAX cannot store all programs
+                code, _, tree = serialize_executable.serialize(compiled)
+                results = jax.tree.unflatten(tree, range(tree.num_leaves))  # JAX cannot pickle the tree itself
+                store(key, zlib.compress(pickle.dumps((code, results, texts_in(lowered.as_text()))), level=1))
+        return compiled
+
+
+def jit_stored(**settings: Any) -> Callable[[Callable[..., T]], StoredProgram[T]]:
+    """Return a decorator that makes functions `StoredProgram`; settings are those of `jax.jit`."""
+    return partial(StoredProgram, **settings)  # pyright: ignore[reportReturnType]
+
+
+def jit_quickly(**settings: Any) -> Callable[[Callable[..., T]], StoredProgram[T]]:
+    """Return a decorator as `jit_stored` does, for functions that run too briefly to repay optimisation.
+
+    XLA compiles them for CPUs without optimising, in about half the time. It then rounds every product before adding to
+    it, where the optimiser may merge a multiplication and an addition into one operation. So a function with products
+    of floats may change its bits: use this only for functions without any (tests/pipeline/jobs/test_programs.py).
+    Physics is our own machine code, which stays optimised. Such a function cannot be called inside `jax.jit`.
+    """
+    return partial(StoredProgram, optimise=False, **settings)  # pyright: ignore[reportReturnType]
+
+
+def _load(key: str, call: Call) -> Any:
+    """Return the stored program, or None if there is none that can be used."""
+    if (found := stored(key)) is None:
+        return None
+    begun = time.perf_counter()
+    with TRACING:
+        try:
+            code, results, kernels = pickle.loads(zlib.decompress(found))
+            for text in kernels:
+                register(text)
+            inputs = jax.tree.structure((tuple(jax.tree.unflatten(call.tree, range(len(call.types)))), {}))
+            program = serialize_executable.deserialize_and_load(code, inputs, jax.tree.structure(results))
+        except Exception:  # whatever is wrong with it, it can be made again
+            return None
+    monitoring.record_event_duration_secs(LOADED, time.perf_counter() - begun)
+    return program
+
+
+def _alone() -> bool:
+    """Whether there is one CPU device and no other."""
+    return jax.default_backend() == "cpu" and jax.device_count() == 1
+
+
+def _type_of(x: Any) -> Any:
+    """Return what a program depends on of an argument."""
+    if not hasattr(x, "dtype"):
+        return type(x).__name__
+    return x.shape, jax.dtypes.canonicalize_dtype(x.dtype), getattr(x, "weak_type", False)
+
+
+def _settings() -> tuple[Any, ...]:
+    values = jax.config.values
+    return values["jax_enable_x64"], values["jax_disable_most_optimizations"]
+
+
+@cache
+def _machine() -> str:
+    """Return what decides compiled code besides the program: settings, libraries and the processor."""
+    values = {name: value for name, value in jax.config.values.items() if "cache" not in name}
+    features = binding.get_host_cpu_features().flatten()
+    return f"{values} {os.environ.get('XLA_FLAGS')} {version('jaxlib')} {binding.get_host_cpu_name()} {features}"

@@ -1,0 +1,121 @@
+"""Programs that one process stores and others load: found by what decides them, and made again if damaged."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import monitoring
+
+from levelproof.levelgen.programs import LOADED, StoredProgram, jit_stored
+from levelproof.levelgen.proofs import examine
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES
+
+SCRIPT = """
+from levelproof.pipeline.runtime import prepare_jax
+prepare_jax()
+from jax import monitoring
+import numpy as np
+events = []
+note = lambda event, seconds, fun_name="", **_: events.append((event, fun_name))
+monitoring.register_event_duration_secs_listener(note)
+from levelproof.levelgen.programs import LOADED
+from levelproof.levelgen.proofs import examine
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES
+facts = examine(sample_levels(np.arange(16), "s"), DEFAULT_RULES, 8)
+print(sum(fun_name == "examine" for _, fun_name in events), sum(event == LOADED for event, _ in events))
+print(np.asarray(facts).tobytes().hex())
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Iterator[Path]:
+    """An empty folder for stored programs; JAX's own stays where it is."""
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    yield tmp_path
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+def plain(x: jax.Array, times: int) -> dict[str, jax.Array]:
+    return {"sum": (x * times).sum(), "all": x + times}
+
+
+def copy_of(function=plain, **settings) -> StoredProgram:
+    """Return the same program as another process would have it: not made yet."""
+    return jit_stored(static_argnames="times", **settings)(function)
+
+
+def loads() -> list[str]:
+    events: list[str] = []
+    monitoring.register_event_duration_secs_listener(
+        lambda event, seconds, **_: events.append(event) if event == LOADED else None
+    )
+    return events
+
+
+def test_another_process_neither_traces_nor_compiles(tmp_path: Path) -> None:
+    environment = {"PATH": "/usr/bin:/bin", "LEVELPROOF_CACHE_DIR": str(tmp_path / "cache")}
+    run = partial(subprocess.run, capture_output=True, text=True, env=environment, cwd=Path(__file__).parents[2])
+    first, second = (run([sys.executable, "-c", SCRIPT]) for _ in range(2))
+    assert not first.returncode, first.stderr
+    (traced, result), (again, same) = (each.stdout.split("\n")[:2] for each in (first, second))
+    assert int(traced.split()[0]) > 0
+    assert traced.split()[1] == "0"
+    assert again == "0 1", second.stdout + second.stderr
+    assert result == same
+
+
+def test_program_is_loaded_once_and_for_its_types_only(folder: Path) -> None:
+    x, loaded = jnp.arange(4.0), loads()
+    expected = jax.jit(plain, static_argnames="times")(x, 3)
+    made = copy_of()
+    for _ in range(2):
+        jax.tree.map(np.testing.assert_array_equal, made(x, times=3), expected)
+    assert made.count() == len(list(folder.glob("*.kernel"))) == 1
+    assert not loaded
+    other = copy_of()
+    jax.tree.map(np.testing.assert_array_equal, other(np.arange(4, dtype=np.float32), 3), expected)
+    assert len(loaded) == other.count() == 1
+    for arguments in ((x, 4), (jnp.arange(5.0), 3), (jnp.arange(4), 3)):
+        other(*arguments)
+    assert other.count() == len(list(folder.glob("*.kernel"))) == 4
+    assert len(loaded) == 1
+
+
+@pytest.mark.parametrize("damage", [b"", b"x" * 200])
+def test_damaged_program_is_made_again(damage: bytes, folder: Path) -> None:
+    x, loaded = jnp.arange(4.0), loads()
+    copy_of()(x, 3)
+    (file,) = folder.glob("*.kernel")
+    file.write_bytes(damage)
+    assert float(copy_of()(x, 3)["sum"]) == 18
+    assert not loaded
+    assert float(copy_of()(x, 3)["sum"]) == 18
+    assert len(loaded) == 1, "the damaged file was replaced"
+
+
+def test_argument_without_a_text_of_its_own_is_not_stored(folder: Path) -> None:
+    assert float(copy_of(lambda x, times: times(x))(jnp.float32(2), lambda x: x * 2)) == 4
+    assert not list(folder.glob("*.kernel"))
+
+
+def test_loaded_program_takes_what_is_donated(folder: Path) -> None:
+    copy_of(donate_argnames="x")(jnp.arange(4.0), 3)
+    x = jnp.arange(4.0)
+    assert copy_of(donate_argnames="x")(x, 3)["all"].tolist() == [3, 4, 5, 6]
+    assert x.is_deleted()
+
+
+def test_stored_program_can_be_part_of_another() -> None:
+    levels = sample_levels(np.arange(16), "s")
+    alone = examine(levels, DEFAULT_RULES, 8)
+    within = jax.jit(lambda levels: examine(levels, DEFAULT_RULES, 8))(levels)
+    jax.tree.map(np.testing.assert_array_equal, within, alone)
