@@ -1,17 +1,18 @@
 """Programs that processes share: one makes them, the others load them without tracing the function.
 
 JAX's own cache is found by the traced program, and tracing takes longer than loading. Here a program is found by the
-function's name, its static arguments, the shapes of the others, all sources, versions and settings of JAX.
+function's name, its static arguments, the shapes of the others, all sources, versions and settings of JAX: a file with
+this key names the file of the program, which is found by the traced program, too, when other sources lead to it.
 """
 
+import hashlib
 import inspect
 import os
 import pickle
 import threading
 import time
 import zlib
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from functools import cache, cached_property, partial, update_wrapper
 from importlib.metadata import version
 from pathlib import Path
@@ -29,6 +30,7 @@ from levelproof.physics.codegen.kept import cache_is_on, key_by_sources, store, 
 UNOPTIMISED = {"xla_backend_optimization_level": 0}
 SOURCES = [Path(__file__).parents[1] / room for room in ("physics", "levelgen", "experts")]
 LOADED = "/jax/core/compile/levelproof_load"  # event that counts as compiling, as JAX's own do
+HIT = "/jax/compilation_cache/cache_hits"  # JAX's event
 TRACING = threading.Lock()  # Python's part of compiling gains nothing from threads, and shares what it caches
 T = TypeVar("T")
 
@@ -107,21 +109,28 @@ class StoredProgram(Generic[T]):
             request = f"{name} {self.optimise} {self._settings} {call} {_machine()}"
             # An object without a text of its own has its address, which means nothing to another process
             key = None if " at 0x" in request else key_by_sources(request, SOURCES)
-            program = (key and _load(key, call)) or self._make(key, args, kwargs)
+            place = stored(key) if key else None
+            program = (place and _load(place.decode(), call)) or self._make(key, call, args, kwargs)
             self._programs[call] = program
         return program
 
-    def _make(self, key: str | None, args: Any, kwargs: Any) -> Any:
+    def _make(self, key: str | None, call: Call, args: Any, kwargs: Any) -> Any:
         bound = self._signature.bind(*args, **kwargs)
         bound.apply_defaults()
         with TRACING:
             lowered = self.program.lower(*bound.args, **bound.kwargs)
+        if not key:
+            return lowered.compile()
+        text = lowered.as_text()
+        place = "program " + hashlib.sha256(f"{text} {self.optimise} {_machine()}".encode()).hexdigest()
+        if program := _load(place, call):
+            store(key, place.encode())
+            return program
+        before = _HITS.count
         compiled = lowered.compile()
-        if key:
-            with suppress(ValueError, NotImplementedError, pickle.PicklingError):  # JAX cannot store all programs
-                code, _, tree = serialize_executable.serialize(compiled)
-                results = jax.tree.unflatten(tree, range(tree.num_leaves))  # JAX cannot pickle the tree itself
-                store(key, zlib.compress(pickle.dumps((code, results, texts_in(lowered.as_text()))), level=1))
+        # What XLA has loaded from JAX's cache it does not store whole
+        if _HITS.count == before and _store(place, compiled, texts_in(text)):
+            store(key, place.encode())
         return compiled
 
 
@@ -141,9 +150,34 @@ def jit_quickly(**settings: Any) -> Callable[[Callable[..., T]], StoredProgram[T
     return partial(StoredProgram, optimise=False, **settings)  # pyright: ignore[reportReturnType]
 
 
-def _load(key: str, call: Call) -> Any:
+class _Hits(threading.local):
+    """How many programs this thread has loaded from JAX's cache."""
+
+    count = 0
+
+    def note(self, event: str, **_: object) -> None:
+        if event == HIT:
+            self.count += 1
+
+
+_HITS = _Hits()
+monitoring.register_event_listener(_HITS.note)
+
+
+def _store(place: str, compiled: Any, kernels: Sequence[str]) -> bool:
+    """Store a program that XLA has just compiled; return whether JAX can."""
+    try:
+        code, _, tree = serialize_executable.serialize(compiled)
+        results = jax.tree.unflatten(tree, range(tree.num_leaves))  # JAX cannot pickle the tree itself
+        store(place, zlib.compress(pickle.dumps((code, results, kernels)), level=1))
+    except (ValueError, NotImplementedError, pickle.PicklingError):
+        return False
+    return True
+
+
+def _load(place: str, call: Call) -> Any:
     """Return the stored program, or None if there is none that can be used."""
-    if (found := stored(key)) is None:
+    if (found := stored(place)) is None:
         return None
     begun = time.perf_counter()
     with TRACING:

@@ -11,6 +11,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
+from jax import monitoring
+
 # s to wait while another process compiles a program; then this one compiles it, too: the other may be suspended, and
 # compiling twice costs less than waiting longer
 MAX_WAIT = 60.0
@@ -83,6 +85,7 @@ def share_compiling() -> None:
             if (folder / f"{key}-cache").exists():
                 executable, _ = compiler._cache_read(name, key, options, backend, devices)
                 if executable is not None:
+                    monitoring.record_event("/jax/compilation_cache/cache_hits")  # as JAX does
                     return executable
             return compile_and_write(backend, module, devices, options, callbacks, name, key)
 

@@ -89,6 +89,7 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
             require_ours()
             fits = source.levels.size if recipe.network.kind is PolicyKind.FLAT else None
             origin = note | {"env_steps": int(learner.updates) * config.ppo.steps_per_update}
+            origin |= {"start_origin": dict(start.origin)} if start else {}
             keep_run(out, Policy(recipe.network, learner.average, fits, origin), learner)
 
         try:

@@ -1,5 +1,6 @@
 """The levels that a policy is trained on by reinforcement: random ones, those of a split, or of level files."""
 
+import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -60,7 +61,8 @@ def levels_for(config: TrainConfig, tell: Callable[[str], None]) -> TrainingLeve
             f"{place} has only copies of sealed levels, which only serve to measure policies: choose others."
         )
     levels = jax.device_put(take(group.levels, np.flatnonzero(usable)))
-    facts = {"levels": str(place), "count": len(levels), "ids": group.level_ids[usable].tolist()}
+    digest = hashlib.sha256("".join(each for each in hashes if each not in sealed).encode()).hexdigest()[:16]
+    facts = {"levels": str(place), "count": len(levels), "content": digest}
     return TrainingLevels(str(place), levels, group.rules, facts)
 
 

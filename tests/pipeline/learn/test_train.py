@@ -88,6 +88,7 @@ def test_diverged_weights_are_not_kept(easy: tuple[str, ...], tmp_path: Path) ->
 def test_folder_holds_a_policy_that_loads_and_is_evaluated(agent: Path, split: Path) -> None:
     policy = levelproof.load_policy(agent)
     assert policy.origin["env_steps"] == 60 * PER_UPDATE
+    assert (agent / "config.json").stat().st_size < 4_000
     done = here(["evaluate", str(agent), "--on", str(split), "--levels", "8", "--attempts", "1"], agent.parent)
     assert done.returncode == 0, done.stderr
     assert (agent / "curves.png").read_bytes().startswith(b"\x89PNG")
@@ -143,6 +144,8 @@ def test_start_keeps_its_weights_while_the_critic_fits(
     words = (f"levels={split}", f"start={agent}", "ppo.critic_updates=2", "ppo.kl_weight=0.2")
     words = (*words, "ppo.kl_updates=2", "interval=1")
     curve = metrics(trained(tmp_path, 5, *words))
+    origin = levelproof.load_policy(tmp_path / "agent").origin
+    assert origin["start_origin"] == levelproof.load_policy(agent).origin
     before = load_file(agent / "policy.safetensors")
     same = [all((weights[name] == before[name]).all() for name in before) for weights in kept[:5]]
     assert same == [True, True, False, False, False]
@@ -174,12 +177,16 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     messages: list[str] = []
     source = levels_for(TrainConfig(levels=str(split), where="label = 'solved'"), messages.append)
     data = levelproof.open(split, where="label = 'solved'")
-    assert source.facts["ids"] == data.manifest["level_id"].to_pylist()
-    export(split, int(source.facts["ids"][0]), tmp_path / "level.json")
+    ids = data.manifest["level_id"].to_pylist()
+    assert source.facts["count"] == len(source.levels) == len(ids)
+    assert np.array_equal(source.levels.state.position, data.levels(np.arange(len(ids))).state.position)
+    fewer = levels_for(TrainConfig(levels=str(split), where=f"label = 'solved' AND level_id > {ids[0]}"), print)
+    assert source.facts["content"] != fewer.facts["content"]
+    export(split, ids[0], tmp_path / "level.json")
     of_files = levels_for(TrainConfig(levels=str(tmp_path)), messages.append)
     assert of_files.facts["count"] == 1
     assert not messages
-    first = source.facts["ids"][0]
+    first = ids[0]
     monkeypatch.setattr(sealed, "SEALED", range(first, first + 2))
     with pytest.raises(levelproof.UserError, match="sealed to measure policies"):
         levels_for(TrainConfig(levels=str(split), where=""), print)
