@@ -3,6 +3,7 @@
 import json
 import math
 import platform
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -60,7 +61,7 @@ class Run:
     def now(benchmark: str, arguments: Sequence[str], report: Report) -> "Run":
         return Run(
             benchmark=benchmark,
-            command=" ".join(("python -m benchmarks", *arguments)),
+            command=f"python -m benchmarks {shlex.join(arguments)}",
             date=datetime.now(UTC).isoformat(timespec="seconds"),
             machine={"device": device(), "cores": len(own_cores()), "system": platform.platform()},
             versions={"ours": versions(), **({"reference": report.reference} if report.reference else {})},
