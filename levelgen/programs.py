@@ -50,6 +50,8 @@ class StoredProgram(Generic[T]):
     Called within `jax.jit`, on a GPU, on several devices or without a folder for the cache, it is `jax.jit` alone.
     """
 
+    __name__: str  # the function's
+
     def __init__(self, function: Callable[..., T], optimise: bool = True, **settings: Any) -> None:
         self.function, self.optimise, self._settings = function, optimise, settings
         self._signature, self._programs = inspect.signature(function), dict[Call, Any]()
@@ -93,14 +95,19 @@ class StoredProgram(Generic[T]):
 
     def _call(self, args: Any, kwargs: Any) -> tuple[list[Any], Call | None]:
         """Return the arguments that are not static, and what decides the program; None: leave it to `jax.jit`."""
-        bound = self._signature.bind(*args, **kwargs)
-        bound.apply_defaults()
+        bound = self._bound(args, kwargs)
         static = tuple(value for name, value in bound.arguments.items() if name in self._static)
         given = [value for name, value in bound.arguments.items() if name not in self._static]
         leaves, tree = jax.tree.flatten(given)
         if any(isinstance(x, Tracer) for x in leaves) or not _alone() or not cache_is_on():
             return given, None
         return given, Call(static, tree, tuple(map(_type_of, leaves)), _settings())
+
+    def _bound(self, args: Any, kwargs: Any) -> inspect.BoundArguments:
+        """Assign the arguments to the function's parameters, defaults included."""
+        bound = self._signature.bind(*args, **kwargs)
+        bound.apply_defaults()
+        return bound
 
     def _ready(self, call: Call, args: Any, kwargs: Any) -> Any:
         """Return the program of a call, from this process, from the disk, or made now."""
@@ -115,8 +122,7 @@ class StoredProgram(Generic[T]):
         return program
 
     def _make(self, key: str | None, call: Call, args: Any, kwargs: Any) -> Any:
-        bound = self._signature.bind(*args, **kwargs)
-        bound.apply_defaults()
+        bound = self._bound(args, kwargs)  # as positional arguments, which is how the program is called
         with TRACING:
             lowered = self.program.lower(*bound.args, **bound.kwargs)
         if not key:
@@ -179,8 +185,8 @@ def _load(place: str, call: Call) -> Any:
     """Return the stored program, or None if there is none that can be used."""
     if (found := stored(place)) is None:
         return None
-    begun = time.perf_counter()
     with TRACING:
+        begun = time.perf_counter()
         try:
             code, results, kernels = pickle.loads(zlib.decompress(found))
             for text in kernels:

@@ -21,16 +21,16 @@ from levelproof.experts.witness.success import no_success
 from levelproof.experts.witness.witness import replay_block
 from levelproof.levelgen.batching import LANES, at_once
 from levelproof.levelgen.level import ACTIONS, Level
-from levelproof.levelgen.programs import TRACING, StoredProgram
+from levelproof.levelgen.programs import StoredProgram
 from levelproof.levelgen.proofs import examine
 from levelproof.physics.buffers import buffers_of
 from levelproof.physics.types import Size
 
 
 class Program(NamedTuple):
-    """A function, and the shapes and settings of a call; once compiled for these, the call compiles nothing."""
+    """A stored function, and the shapes and settings of a call; once compiled for these, the call compiles nothing."""
 
-    function: Any
+    function: StoredProgram
     call: Callable[[], tuple[tuple[Any, ...], dict[str, Any]]]  # makes the positional and named arguments
     stage: str = ""  # stage whose slots it serves; distinguishes programs of one function
 
@@ -41,12 +41,7 @@ class Program(NamedTuple):
     def prepare(self) -> None:
         """Load or compile it, for this process and others with the same cache folder."""
         arguments, settings = self.call()
-        if isinstance(self.function, StoredProgram):
-            self.function.prepare(*arguments, **settings)
-        else:
-            with TRACING:
-                lowered = self.function.lower(*arguments, **settings)
-            lowered.compile()
+        self.function.prepare(*arguments, **settings)
 
 
 def programs_of(pool: Pool, size: Size) -> list[Program]:

@@ -65,7 +65,7 @@ class Varying:
     length: Int[Array, " level"]  # of the success, env steps; 0: none
 
 
-@jax.jit
+@jit_stored()
 def nearest_of(archive: Archive) -> Approaches:
     """Return the trajectories to the archived states nearest to the goal; each repeats its last action to the end."""
     entry = archive.entry

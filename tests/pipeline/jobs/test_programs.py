@@ -16,7 +16,6 @@ from levelproof.experts.pool.pool import Pool
 from levelproof.experts.pool.programs import Program, programs_of
 from levelproof.experts.pool.run import TrainingRun
 from levelproof.levelgen.level import SIZES
-from levelproof.levelgen.programs import StoredProgram
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.pipeline.claims import try_claim
 from levelproof.pipeline.jobs.ahead import DONE, Ahead
@@ -93,8 +92,7 @@ def test_ahead_skips_what_another_process_compiles(job: JobConfig, pool: Pool, c
 
 
 def test_programs_without_optimiser_multiply_no_floats(programs: list[Program]) -> None:
-    stored = (program for program in programs if isinstance(program.function, StoredProgram))
-    quick = [program for program in stored if not program.function.optimise]
+    quick = [program for program in programs if not program.function.optimise]
     decorated = [path.read_text().count("\n@jit_quickly") for path in (ROOT / "experts").rglob("*.py")]
     assert len({program.function for program in quick}) == sum(decorated)
     for program in quick:
