@@ -128,7 +128,9 @@ class StoredProgram(Generic[T]):
         if not key:
             return lowered.compile()
         text = lowered.as_text()
-        place = "program " + hashlib.sha256(f"{text} {self.optimise} {_machine()}".encode()).hexdigest()
+        # The text leaves out arguments that nothing reads, but a loaded program checks the shapes of all
+        described = f"{text} {call.tree} {call.types} {self.optimise} {_machine()}"
+        place = "program " + hashlib.sha256(described.encode()).hexdigest()
         if program := _load(place, call):
             store(key, place.encode())
             return program

@@ -118,6 +118,13 @@ def test_damaged_program_is_made_again(damage: bytes, folder: Path) -> None:
     assert len(loaded) == 1, "the damaged file was replaced"
 
 
+def test_shapes_of_arguments_that_nothing_reads_count(folder: Path) -> None:
+    """Levels of another size may differ only in fields that a program ignores."""
+    program = jit_stored()(lambda x, ignored: 2 * x)
+    for width in (3, 4):
+        assert float(program(jnp.float32(1), jnp.zeros(width))) == 2
+
+
 def test_argument_without_a_text_of_its_own_is_not_stored(folder: Path) -> None:
     assert float(copy_of(lambda x, times: times(x))(jnp.float32(2), lambda x: x * 2)) == 4
     assert not list(folder.glob("*.kernel"))
