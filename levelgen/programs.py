@@ -30,7 +30,7 @@ from levelproof.physics.codegen.kept import cache_is_on, key_by_sources, store, 
 UNOPTIMISED = {"xla_backend_optimization_level": 0}
 SOURCES = [Path(__file__).parents[1] / room for room in ("physics", "levelgen", "experts")]
 LOADED = "/jax/core/compile/levelproof_load"  # event that counts as compiling, as JAX's own do
-HIT = "/jax/compilation_cache/cache_hits"  # JAX's event
+COMPILED = "/jax/compilation_cache/cache_misses"  # JAX's event when it has compiled a program and written it
 TRACING = threading.Lock()  # Python's part of compiling gains nothing from threads, and shares what it caches
 T = TypeVar("T")
 
@@ -55,6 +55,7 @@ class StoredProgram(Generic[T]):
     def __init__(self, function: Callable[..., T], optimise: bool = True, **settings: Any) -> None:
         self.function, self.optimise, self._settings = function, optimise, settings
         self._signature, self._programs = inspect.signature(function), dict[Call, Any]()
+        self._locks: dict[Call, threading.Lock] = {}
         names = settings.get("static_argnames", ())
         self._static = {names} if isinstance(names, str) else set(names)
         update_wrapper(self, function)
@@ -111,15 +112,20 @@ class StoredProgram(Generic[T]):
 
     def _ready(self, call: Call, args: Any, kwargs: Any) -> Any:
         """Return the program of a call, from this process, from the disk, or made now."""
-        if (program := self._programs.get(call)) is None:
-            name = f"{self.function.__module__}.{self.function.__qualname__}"
-            request = f"{name} {self.optimise} {self._settings} {call} {_machine()}"
-            # An object without a text of its own has its address, which means nothing to another process
-            key = None if " at 0x" in request else key_by_sources(request, SOURCES)
-            place = stored(key) if key else None
-            program = (place and _load(place.decode(), call)) or self._make(key, call, args, kwargs)
-            self._programs[call] = program
-        return program
+        if (program := self._programs.get(call)) is not None:
+            return program
+        with self._locks.setdefault(call, threading.Lock()):  # of the threads that need it, one makes it
+            if call not in self._programs:
+                self._programs[call] = self._found_or_made(call, args, kwargs)
+        return self._programs[call]
+
+    def _found_or_made(self, call: Call, args: Any, kwargs: Any) -> Any:
+        name = f"{self.function.__module__}.{self.function.__qualname__}"
+        request = f"{name} {self.optimise} {self._settings} {call} {_machine()}"
+        # An object without a text of its own has its address, which means nothing to another process
+        key = None if " at 0x" in request else key_by_sources(request, SOURCES)
+        place = stored(key) if key else None
+        return (place and _load(place.decode(), call)) or self._make(key, call, args, kwargs)
 
     def _make(self, key: str | None, call: Call, args: Any, kwargs: Any) -> Any:
         bound = self._bound(args, kwargs)  # as positional arguments, which is how the program is called
@@ -134,10 +140,10 @@ class StoredProgram(Generic[T]):
         if program := _load(place, call):
             store(key, place.encode())
             return program
-        before = _HITS.count
+        before = _COMPILED.count
         compiled = lowered.compile()
-        # What XLA has loaded from JAX's cache it does not store whole
-        if _HITS.count == before and _store(place, compiled, texts_in(text)):
+        # What XLA has loaded from JAX's cache, here or in another thread, it does not store whole
+        if _COMPILED.count > before and _store(place, compiled, texts_in(text)):
             store(key, place.encode())
         return compiled
 
@@ -158,18 +164,18 @@ def jit_quickly(**settings: Any) -> Callable[[Callable[..., T]], StoredProgram[T
     return partial(StoredProgram, optimise=False, **settings)  # pyright: ignore[reportReturnType]
 
 
-class _Hits(threading.local):
-    """How many programs this thread has loaded from JAX's cache."""
+class _FreshlyCompiled(threading.local):
+    """How many programs this thread has compiled."""
 
     count = 0
 
     def note(self, event: str, **_: object) -> None:
-        if event == HIT:
+        if event == COMPILED:
             self.count += 1
 
 
-_HITS = _Hits()
-monitoring.register_event_listener(_HITS.note)
+_COMPILED = _FreshlyCompiled()
+monitoring.register_event_listener(_COMPILED.note)
 
 
 def _store(place: str, compiled: Any, kernels: Sequence[str]) -> bool:
@@ -187,16 +193,15 @@ def _load(place: str, call: Call) -> Any:
     """Return the stored program, or None if there is none that can be used."""
     if (found := stored(place)) is None:
         return None
-    with TRACING:
-        begun = time.perf_counter()
-        try:
-            code, results, kernels = pickle.loads(zlib.decompress(found))
-            for text in kernels:
-                register(text)
-            inputs = jax.tree.structure((tuple(jax.tree.unflatten(call.tree, range(len(call.types)))), {}))
-            program = serialize_executable.deserialize_and_load(code, inputs, jax.tree.structure(results))
-        except Exception:  # whatever is wrong with it, it can be made again
-            return None
+    begun = time.perf_counter()
+    try:
+        code, results, kernels = pickle.loads(zlib.decompress(found))
+        for text in kernels:
+            register(text)
+        inputs = jax.tree.structure((tuple(jax.tree.unflatten(call.tree, range(len(call.types)))), {}))
+        program = serialize_executable.deserialize_and_load(code, inputs, jax.tree.structure(results))
+    except Exception:  # whatever is wrong with it, it can be made again
+        return None
     monitoring.record_event_duration_secs(LOADED, time.perf_counter() - begun)
     return program
 

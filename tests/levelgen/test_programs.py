@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jax
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import monitoring
+from jax.experimental.compilation_cache import compilation_cache
 
 from levelproof.levelgen.programs import LOADED, StoredProgram, jit_stored
 from levelproof.levelgen.proofs import examine
@@ -36,11 +38,13 @@ print(np.asarray(facts).tobytes().hex())
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Iterator[Path]:
-    """An empty folder for stored programs; JAX's own stays where it is."""
+    """An empty folder for stored programs and for JAX's own."""
     before = jax.config.values["jax_compilation_cache_dir"]
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    compilation_cache.reset_cache()
     yield tmp_path
     jax.config.update("jax_compilation_cache_dir", before)
+    compilation_cache.reset_cache()
 
 
 def plain(x: jax.Array, times: int) -> dict[str, jax.Array]:
@@ -48,7 +52,8 @@ def plain(x: jax.Array, times: int) -> dict[str, jax.Array]:
 
 
 def copy_of(function=plain, **settings) -> StoredProgram:
-    """Return the same program as another process would have it: not made yet."""
+    """Return the same program as another process would have it: not made yet, and unknown to JAX."""
+    jax.clear_caches()
     return jit_stored(static_argnames="times", **settings)(function)
 
 
@@ -89,7 +94,7 @@ def test_program_of_jax_cache_is_not_stored(tmp_path: Path) -> None:
 
 def test_program_is_loaded_once_and_for_its_types_only(folder: Path) -> None:
     x, loaded = jnp.arange(4.0), loads()
-    expected = jax.jit(plain, static_argnames="times")(x, 3)
+    expected = plain(x, 3)
     made = copy_of()
     for _ in range(2):
         jax.tree.map(np.testing.assert_array_equal, made(x, times=3), expected)
@@ -112,6 +117,8 @@ def test_damaged_program_is_made_again(damage: bytes, folder: Path) -> None:
     copy_of()(x, 3)
     for file in folder.glob("*.kernel"):
         file.write_bytes(damage)
+    for file in folder.glob("*-cache"):  # what JAX reads from its own cache is not stored again
+        file.unlink()
     assert float(copy_of()(x, 3)["sum"]) == 18
     assert not loaded
     assert float(copy_of()(x, 3)["sum"]) == 18
@@ -123,6 +130,30 @@ def test_shapes_of_arguments_that_nothing_reads_count(folder: Path) -> None:
     program = jit_stored()(lambda x, ignored: 2 * x)
     for width in (3, 4):
         assert float(program(jnp.float32(1), jnp.zeros(width))) == 2
+
+
+def test_program_that_jax_has_compiled_in_another_thread_is_not_stored(folder: Path) -> None:
+    """JAX hands it over without a word, and it may come from JAX's cache, so that XLA would not store it whole."""
+    copies = [copy_of(), jit_stored(static_argnames="times")(plain)]
+    copies[0](jnp.arange(4.0), 3)
+    stored = {*folder.glob("*.kernel")}
+    for file in stored:
+        file.unlink()
+    assert float(copies[1](jnp.arange(4.0), 3)["sum"]) == 18
+    assert not list(folder.glob("*.kernel"))
+
+
+def test_threads_make_a_program_once(folder: Path) -> None:
+    traced: list[int] = []
+
+    def traces(x: jax.Array) -> jax.Array:
+        traced.append(1)
+        return 2 * x
+
+    program = jit_stored()(traces)
+    with ThreadPoolExecutor(4) as threads:
+        assert [float(two) for two in threads.map(program, [np.float32(1)] * 4)] == [2.0] * 4
+    assert len(traced) == program.count() == 1
 
 
 def test_argument_without_a_text_of_its_own_is_not_stored(folder: Path) -> None:
