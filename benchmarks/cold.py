@@ -86,6 +86,7 @@ def _from_nothing(jobs: dict[str, Sequence[str]], number: int) -> list[dict[str,
     """Run the jobs, one after another, from an empty cache folder."""
     with tempfile.TemporaryDirectory() as name:
         environment = os.environ | {CACHE_VARIABLE: str(Path(name, "cache"))}
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)  # Python would compile all sources in every run
         calibration = float(subprocess.check_output([sys.executable, "-c", CALIBRATION], text=True))
         return [
             {"run": number, "job": job, "calibration": calibration, **generated(settings, Path(name, job), environment)}

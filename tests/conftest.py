@@ -25,6 +25,8 @@ prepare_jax()
 # Ray starts workers with a niceness of 15: beside two tests that compute they get 4% of the machine, so that their
 # tests would wait for others to end, not for a defect.
 os.environ.setdefault("RAY_worker_niceness", "0")
+# Commands that tests start would compile all of Python's sources, every time.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # A local Ray makes its process ask for tokens, and so all that the process starts later. A command that asks for them
 # waits for ever for a head that has none.
 os.environ.setdefault("RAY_AUTH_MODE", "disabled")
