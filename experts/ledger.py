@@ -4,6 +4,7 @@ Levels run side by side. Stages that serve all levels of a unit are split evenly
 proportion to env steps. Compiling is counted separately, because a worker pays for it once, whatever it makes.
 """
 
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,15 +27,14 @@ class Lap:
     compiling: float = 0.0
 
 
-class _Compiled:
-    """Seconds that JAX has spent compiling in this process; of nested traces only the outer one counts."""
+class _Compiled(threading.local):
+    """Seconds that JAX has spent compiling in this thread; of nested traces only the outer one counts."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
         self._last: list[tuple[float, float]] = []  # start and duration of the latest events, none nested
-        monitoring.register_event_duration_secs_listener(self._note)
 
-    def _note(self, event: str, duration_secs: float, **_: object) -> None:
+    def note(self, event: str, duration_secs: float, **_: object) -> None:
         if not event.startswith(COMPILING):
             return
         start = time.perf_counter() - duration_secs
@@ -45,6 +45,7 @@ class _Compiled:
 
 
 _compiled = _Compiled()
+monitoring.register_event_duration_secs_listener(_compiled.note)
 
 
 @contextmanager

@@ -29,7 +29,7 @@ NO_GPU = "JAX cannot use one here, which needs levelproof's extra `gpu`"
 LAST_CHECK = "looked"  # file beside the programs, touched when a check begins; programs older than it were readable
 CLAIM_SECONDS = 2.0  # s for which a worker tries to claim a core
 CLAIMS: list[socket.socket] = []  # sockets that mark this process's core as taken
-# Settings of JAX that change results or reject this code; a user's environment or configuration may have set them
+# Settings of JAX that change results or speed, or reject this code; an environment or configuration may have set them
 JAX_SETTINGS = {
     "jax_enable_x64": False,
     "jax_default_matmul_precision": None,
@@ -38,6 +38,7 @@ JAX_SETTINGS = {
     "jax_disable_jit": False,
     "jax_debug_nans": False,  # diverging worlds contain NaNs
     "jax_debug_infs": False,
+    "jax_cpu_enable_async_dispatch": False,  # else programs of several threads wait in one queue
 }
 
 

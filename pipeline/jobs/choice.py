@@ -5,7 +5,10 @@ from dataclasses import replace
 from levelproof.configs.numbers import parse_count
 from levelproof.configs.schema import GrowConfig, JobConfig
 from levelproof.pipeline.jobs.address import ray_address
+from levelproof.pipeline.runtime import own_cores
 
+MANY = 16  # levels; a job of fewer may compile programs that it does not use, and leave slots of its programs empty
+MAX_THREADS = 6  # workers in one process: Python, unlike compiled code, runs in one thread at a time
 SMALL = 2  # untimed work units; a process makes them in the time in which Ray and its workers start
 DEFAULT_BUDGET = parse_count(JobConfig.budget, "budget")  # env steps; the search, which it does not limit, takes longer
 
@@ -26,3 +29,16 @@ def runs_here(job: JobConfig, levels: int) -> bool:
     # To grow a level costs the same whatever its expert's budget was
     budget = DEFAULT_BUDGET if isinstance(job, GrowConfig) else max(job.env_steps, DEFAULT_BUDGET)
     return levels * budget <= SMALL * unit * DEFAULT_BUDGET
+
+
+def workers_here(job: JobConfig, levels: int) -> int:
+    """Return the number of workers of a job that runs in the command's own process, each in a thread of its own.
+
+    Args:
+        job: a job for which `runs_here` is True.
+        levels: number of levels to make.
+    """
+    if job.device == "gpu":
+        return 1
+    most = min(job.workers or MAX_THREADS, len(own_cores()), MAX_THREADS)
+    return max(1, min(most, levels // MANY))

@@ -1,23 +1,30 @@
-"""The executor without Ray: one worker in this process."""
+"""The executor without Ray: workers in threads of this process, which compiled code lets run side by side."""
 
 import time
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from levelproof.configs.schema import JobConfig
+from levelproof.pipeline.jobs.choice import MANY, MAX_THREADS, workers_here
 from levelproof.pipeline.jobs.progress import STOPPING, Board
-from levelproof.pipeline.jobs.schedule import ROUND, Scheduler, Settle
+from levelproof.pipeline.jobs.schedule import ROUND, Round, Scheduler, Settle
 from levelproof.pipeline.runtime import NO_GPU, jax_sees_a_gpu, own_cores, prepare_jax
 from levelproof.pipeline.stopping import Stop
 
 if TYPE_CHECKING:
     from levelproof.pipeline.jobs.ahead import Ahead
+    from levelproof.pipeline.jobs.grower import Grower
+    from levelproof.pipeline.jobs.worker import Worker
 
-HERE = "this process"
-POLL = 0.25  # s between progress updates while programs compile
-MAX_THREADS = 6  # threads that compile; one at a time traces, which takes a fifth of the time
-MANY = 16  # levels; a job of fewer may compile programs that it does not use
+POLL = 0.25  # s between progress updates while threads compile or work
+
+
+class Handle(NamedTuple):
+    """A worker, as the scheduler and the events know it."""
+
+    number: int
+    host: str = "this process"
 
 
 def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board: Board, stop: Stop) -> None:
@@ -30,25 +37,50 @@ def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board
     from levelproof.pipeline.jobs.workers import worker_for
 
     with stop.heeded():
-        worker = worker_for(job, split)
+        count = workers_here(job, scheduler.waiting)
+        workers = {Handle(number): worker_for(job, split) for number in range(count)}
+        first = next(iter(workers.values()))
         threads = min(len(own_cores()), MAX_THREADS)
-        if worker.pool and job.device == "cpu" and threads > 1 and scheduler.waiting >= MANY:
-            worker.compiling = _compile_side_by_side(Ahead(job, worker.pool), threads, board, stop)
-            if stop.asked.is_set():
-                return  # no level has begun
-        scheduler.join(HERE, time.monotonic())
-        while not scheduler.over:
-            if stop.asked.is_set():
-                board.say(STOPPING)
-                worker.stopping = True
-            order = scheduler.order(HERE, time.monotonic())
+        if first.pool and job.device == "cpu" and threads > 1 and scheduler.waiting >= MANY:
+            first.compiling = _compile_side_by_side(Ahead(job, first.pool), threads, board, stop)
+        if not stop.asked.is_set():  # else no level has begun
+            _work(workers, scheduler, settle, board, stop)
+
+
+def _work(
+    workers: "dict[Handle, Worker | Grower]", scheduler: Scheduler, settle: Settle, board: Board, stop: Stop
+) -> None:
+    """Let each worker make levels in a thread of its own; only this thread touches the scheduler and the board."""
+
+    def report(handle: Handle, round: Round) -> None:
+        scheduler.report(handle, round, time.monotonic())
+        board.tally.follow(round)
+        settle(round.outcomes)
+
+    def begin(handle: Handle) -> Future[Round] | None:
+        """Let an idle worker go on, if it has levels or now gets some."""
+        order = scheduler.order(handle, time.monotonic())
+        if not scheduler.workers[handle].units:
+            return None
+        return threads.submit(workers[handle].work, order, ROUND, stop.asked.is_set)
+
+    with ThreadPoolExecutor(len(workers)) as threads:
+        for handle in workers:
+            scheduler.join(handle, time.monotonic())
+        working: dict[Future[Round], Handle] = {}
+        while not (scheduler.over or stop.asked.is_set()):
+            scheduler.share()
+            idle = [handle for handle in workers if handle not in working.values()]
+            working |= {future: handle for handle in idle if (future := begin(handle))}
             board.refresh()
-            round = worker.work(order, ROUND, stop.asked.is_set)
-            scheduler.report(HERE, round, time.monotonic())
-            board.tally.follow(round)
-            settle(round.outcomes)
-            if round.leaves:
-                raise KeyboardInterrupt
+            for future in wait(working, POLL, FIRST_COMPLETED).done:
+                report(working.pop(future), future.result())
+        if stop.asked.is_set():
+            board.say(STOPPING)
+            for future, handle in working.items():
+                report(handle, future.result())
+            for handle, worker in workers.items():  # in this thread, where a second Ctrl-C interrupts it
+                report(handle, worker.leave())
 
 
 def _compile_side_by_side(ahead: "Ahead", threads: int, board: Board, stop: Stop) -> float:

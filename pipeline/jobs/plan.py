@@ -18,7 +18,7 @@ from levelproof.configs.schema import MAX_FRAME_SKIP, JobConfig
 from levelproof.experts.labels import WITNESSED, Label
 from levelproof.experts.steps import Seconds
 from levelproof.pipeline.errors import Failure, UserError
-from levelproof.pipeline.jobs.choice import runs_here
+from levelproof.pipeline.jobs.choice import runs_here, workers_here
 from levelproof.pipeline.jobs.forecast import LIKELY, Forecast, PerWitness, Sample, forecast
 from levelproof.pipeline.jobs.generate import generate
 from levelproof.pipeline.jobs.progress import say
@@ -85,7 +85,7 @@ def measure(job: JobConfig, console: Console, seconds: float = SECONDS) -> Sampl
     """Make some of a job's first levels: a few to learn how many fit into `seconds`, then that many."""
     levels, unit = len(job.level_ids), job.levels_per_unit
     inline = runs_here(job, levels)
-    here = 1 if inline else min(job.workers or len(own_cores()), len(own_cores()))
+    here = workers_here(job, levels) if inline else min(job.workers or len(own_cores()), len(own_cores()))
     job = replace(job, executor="inline" if inline else "ray")
     with scratch() as folder, _announced(console, seconds):
         split, begun = split_path(str(folder), job.budget, job.size), time.monotonic()

@@ -3,7 +3,8 @@
 import pytest
 
 from levelproof.configs.schema import GrowConfig
-from levelproof.pipeline.jobs.choice import runs_here
+from levelproof.pipeline.jobs.choice import MANY, MAX_THREADS, runs_here, workers_here
+from levelproof.pipeline.runtime import own_cores
 from tests.pipeline.made import made_job
 
 HERE, ON_RAY = "executor=inline", "executor=ray"
@@ -37,3 +38,14 @@ def test_job_runs_on_the_cluster_that_the_environment_names(monkeypatch: pytest.
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:9")
     assert not runs_here(job, 1)
     assert runs_here(made_job("data", HERE), 10_000)
+
+
+@pytest.mark.parametrize(
+    ("words", "levels", "most"),
+    [((), 64, MAX_THREADS), (("workers=1",), 64, 1), (("device=gpu",), 64, 1), ((), 2 * MANY - 1, 1), ((), 1, 1)],
+)
+def test_job_of_this_process_has_a_worker_for_each_core_that_it_can_fill(
+    words: tuple[str, ...], levels: int, most: int
+) -> None:
+    expected = min(len(own_cores()), most, max(1, levels // MANY))
+    assert workers_here(made_job("data", HERE, *words), levels) == expected
