@@ -127,7 +127,7 @@ def test_own_core_gives_each_worker_another_core(tmp_path: Path) -> None:
 def test_prepare_jax_overrides_settings_that_change_results(tmp_path: Path) -> None:
     program = (
         "from levelproof.pipeline.runtime import prepare_jax, JAX_SETTINGS; prepare_jax(); import jax; "
-        "print(all(getattr(jax.config, name) == value for name, value in JAX_SETTINGS.items()))"
+        "print(all(jax.config.values[name] == value for name, value in JAX_SETTINGS.items()))"
     )
     theirs = {
         "JAX_ENABLE_X64": "1",
@@ -136,6 +136,7 @@ def test_prepare_jax_overrides_settings_that_change_results(tmp_path: Path) -> N
         "JAX_NUMPY_RANK_PROMOTION": "raise",
         "JAX_DISABLE_JIT": "1",
         "JAX_DEBUG_NANS": "1",
+        "JAX_CPU_ENABLE_ASYNC_DISPATCH": "1",
     }
     assert python(program, tmp_path, **theirs).strip() == "True"
 

@@ -62,6 +62,7 @@ def test_callers_jax_flag_leaves_draws_unchanged(name: str) -> None:
         np.testing.assert_array_equal(usual, np.asarray(jax.jit(draw)(key)))
 
 
+@pytest.mark.campaign
 def test_environment_variables_leave_levels_and_random_play_unchanged() -> None:
     command = [sys.executable, "-m", "tests.levelgen.identity.test_flags"]
     folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]

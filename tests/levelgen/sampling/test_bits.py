@@ -29,12 +29,6 @@ def test_levels_have_their_golden_bits(name: str) -> None:
     assert digests(*name.split("/"), CHUNK) == GOLDEN[name][:1]
 
 
-@pytest.mark.parametrize("processor", OLD)
-def test_levels_have_the_same_bits_on_other_processors(processor: str) -> None:
-    made = json.loads(run_on(processor, "tests.levelgen.sampling.bits", str(CHUNK), *DEFAULTS))
-    assert made == {name: GOLDEN[name][:1] for name in DEFAULTS}
-
-
 @pytest.mark.campaign
 @pytest.mark.parametrize("processor", [*(old.values[0] for old in OLD), OWN])
 def test_levels_of_all_presets_have_their_golden_bits(processor: str) -> None:

@@ -13,7 +13,7 @@ from typing import NoReturn
 import pytest
 
 from levelproof.pipeline.cli import main
-from levelproof.pipeline.jobs.inline import HERE
+from levelproof.pipeline.jobs.inline import Handle
 from levelproof.pipeline.store import seal
 from levelproof.pipeline.store.event_files import events_of, runs_in
 from levelproof.pipeline.store.layout import data_paths
@@ -33,7 +33,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.returncode == 0, done.stderr
     assert "4/4 levels" in done.stderr
     (events,) = map(events_of, runs_in(folder / "data/5k/s"))
-    assert [*events[-1]["workers"]] == [HERE], "so small a job starts no workers"
+    assert [*events[-1]["workers"]] == [Handle(0).host], "so small a job starts no workers"
     return folder
 
 

@@ -290,7 +290,7 @@ def checkpoints(folder: Path) -> Target:
     job = made_job("data", "expert.width=8", "expert.environments=24", "expert.attempts=8")
     ids, path, good = np.arange(2, dtype=np.int32), folder / "experts.npz", folder / "good.npz"
     levels = sample_levels(ids, size_of("s"), job.distribution)
-    shapes = jax.eval_shape(lambda: begin(levels, ids, no_success(len(ids)), job.expert))
+    shapes = begin.eval_shape(levels, ids, no_success(len(ids)), job.expert)
     begun = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
     save_experts(good, {i: KeptExpert(jax.tree.map(lambda x, i=i: x[i], begun), [0.0]) for i in range(2)})
     data = good.read_bytes()

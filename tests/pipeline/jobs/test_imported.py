@@ -128,7 +128,7 @@ def test_repair_rejects_an_imported_split(folder: Path) -> None:
 
 
 def test_regenerate_labels_imported_levels_at_another_budget(once: Path, tmp_path: Path) -> None:
-    words = [f"manifest={once / 'data/1M/s'}", "budget=5k", "procedure=label", "executor=inline"]
+    words = [f"manifest={once / 'data/1M/s'}", "budget=5k", "executor=inline"]
     done = here(["regenerate", *words, "where=label != 'solved'"], tmp_path)
     assert done.returncode == 0, done.stderr
     before = [row for row in rows_of(once / "data/1M/s") if row["label"] != "solved"]

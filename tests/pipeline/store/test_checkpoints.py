@@ -31,7 +31,7 @@ def some_experts(job: JobConfig) -> list[KeptExpert]:
     ids = np.arange(UNITS, dtype=np.int32)
     levels = sample_levels(ids, SIZES["s"], job.distribution)
     rng = np.random.default_rng(0)
-    shapes = jax.eval_shape(lambda: begin(levels, ids, no_success(len(ids)), job.expert))
+    shapes = begin.eval_shape(levels, ids, no_success(len(ids)), job.expert)
     random = lambda x: np.frombuffer(rng.bytes(x.size * x.dtype.itemsize), x.dtype).reshape(x.shape)
     begun = jax.tree.map(lambda x: rng.random(x.shape) < 0.5 if x.dtype == bool else random(x), shapes)
     return [KeptExpert(jax.tree.map(lambda x, i=i: x[i], begun), [0.0]) for i in range(UNITS)]

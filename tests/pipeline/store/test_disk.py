@@ -55,7 +55,7 @@ def kept_experts() -> dict[int, KeptExpert]:
     job = made_job("data", "expert.width=8", "expert.environments=24", "expert.attempts=8")
     ids = np.arange(1, dtype=np.int32)
     levels = sample_levels(ids, SIZES["s"], job.distribution)
-    begun = jax.eval_shape(lambda: begin_experts(levels, ids, no_success(len(ids)), job.expert))
+    begun = begin_experts.eval_shape(levels, ids, no_success(len(ids)), job.expert)
     return {0: KeptExpert(jax.tree.map(lambda x: np.zeros(x.shape[1:], x.dtype), begun), [0.0])}
 
 
