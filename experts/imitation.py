@@ -74,10 +74,21 @@ def optimiser_of(config: ImitationConfig) -> optax.GradientTransformation:
 
 
 @partial(jax.jit, static_argnames=("network", "size", "config"))
-def begin_imitation(seed: Int[Array, ""], network: NetworkConfig, size: Size, config: ImitationConfig) -> Imitation:
-    """Initialise a policy; `size` is the levels' size, which matters only if the network fits a single size."""
-    params = initial_policy(key_of_seed(seed), network, size)
-    return Imitation(params, optimiser_of(config).init(params), params, jnp.int32(0))
+def begin_imitation(
+    seed: Int[Array, ""],
+    network: NetworkConfig,
+    size: Size,
+    config: ImitationConfig,
+    start: VariableDict | None = None,
+) -> Imitation:
+    """Begin to train a policy from the parameters `start`, or from scratch.
+
+    `size` is the levels' size, which matters only if the network fits a single size.
+    """
+    params = initial_policy(key_of_seed(seed), network, size) if start is None else start
+    # Copies, because updates donate both, and no buffer can be donated twice
+    params, average = jax.tree.map(jnp.copy, (params, params))
+    return Imitation(params, optimiser_of(config).init(params), average, jnp.int32(0))
 
 
 @partial(jax.jit, static_argnames=("network", "config"), donate_argnums=0)
@@ -109,6 +120,14 @@ def _loss(params: VariableDict, transitions: Transitions, network: NetworkConfig
     loss = -(log_probability(logits, action, live) / count).mean()
     right = ((most_probable(logits) == action) & live).sum(0) / count
     return loss, Likeness(loss, right.mean())
+
+
+def to_motion(state: State, contacts: bool) -> Float[Array, "lane column"]:
+    """Return the motion of states, as `Transitions` have it; `contacts`: with the columns of contacts."""
+    columns = state.position, state.velocity, state.rotation[:, None], state.angular_velocity[:, None]
+    moving = jnp.concatenate(columns, 1)
+    motion = moving.reshape(-1, moving.shape[-1]).T
+    return jnp.concatenate([motion, state.contact_active.T.astype(motion.dtype)], 1) if contacts else motion
 
 
 def from_motion(motion: Float[Array | np.ndarray, "lane column"], size: Size) -> State:
