@@ -32,11 +32,11 @@ from levelproof.pipeline.learn.folder import (
 )
 from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.pool import Feed, PartedSplit, Transitions, validation_batches
-from levelproof.pipeline.learn.sealed import require_not_sealed, sealed_hashes
+from levelproof.pipeline.learn.sealed import require_not_sealed, without_sealed
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.disk import explaining_writes
 from levelproof.pipeline.store.locks import only_clone
-from levelproof.pipeline.words import duration, many
+from levelproof.pipeline.words import duration
 
 COURSE = Curves(
     "bc/updates",
@@ -92,13 +92,8 @@ def source_of(split: Path, config: CloneConfig, tell: Callable[[str], None]) -> 
     ids = data.manifest["level_id"].to_numpy()
     require_not_sealed(split, ids)
     hashes = data.content_hashes
-    sealed = sealed_hashes(data.size)
-    usable = np.array([content_hash not in sealed for content_hash in hashes])
+    usable = without_sealed(split, hashes, data.size, tell)
     copies = int((~usable).sum())
-    if copies:
-        tell(
-            f"{split}: {many(copies, 'level')} left out: copies of sealed levels, which only serve to measure policies."
-        )
     train, kept = (np.flatnonzero(usable & in_subset(hashes, part, config.validation)) for part in (TRAIN, VALIDATION))
     if not len(train) or not len(kept):
         count = len(data) - copies

@@ -1,5 +1,6 @@
 """The folder of a run that makes a policy: what decides the run, its checkpoint and its policy; and the run's bar."""
 
+import hashlib
 import json
 import math
 from collections.abc import Iterator
@@ -11,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from safetensors.numpy import load, save
 
-from levelproof.experts.networks.saved import CONFIG, Policy, named, save_policy, unnamed
+from levelproof.experts.networks.saved import CONFIG, WEIGHTS, Policy, named, policy_folder, save_policy, unnamed
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.store.disk import NotRegular, read_regular
 from levelproof.pipeline.store.files import write
@@ -62,6 +63,11 @@ def continued(out: Path, fresh: T) -> T:
         raise
     except Exception as error:  # the library raises types of its own
         raise Failure(f"The checkpoint in {out} is damaged ({error}): start again with another -o.") from None
+
+
+def weights_digest(policy: str) -> str | None:
+    """Return the SHA-256 of the weights of the policy that a run starts from; None for an empty name."""
+    return hashlib.sha256(read_regular(policy_folder(policy) / WEIGHTS)).hexdigest() if policy else None
 
 
 def require_finite(loss: float, setting: str) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -63,6 +64,27 @@ def require_not_sealed(split: Path, ids: Int[np.ndarray, " level"]) -> None:
         raise UserError(
             f"{split} has {many(sealed, 'level')} with ids from {SEALED.start} to {SEALED.stop - 1}, which are sealed "
             f"to measure policies: exclude them, as in where='level_id < {SEALED.start}'."
+        )
+
+
+def without_sealed(
+    place: Path, hashes: Iterable[str], size: Size, tell: Callable[[str], None]
+) -> Bool[np.ndarray, " level"]:
+    """Return which levels of a split or of files, by content hash, are not copies of sealed ones; report the others."""
+    sealed = sealed_hashes(size)
+    usable = np.array([content_hash not in sealed for content_hash in hashes])
+    if copies := int((~usable).sum()):
+        tell(
+            f"{place}: {many(copies, 'level')} left out: copies of sealed levels, which only serve to measure policies."
+        )
+    return usable
+
+
+def require_some_usable(place: Path, usable: Bool[np.ndarray, " level"]) -> None:
+    """Raise UserError if all levels are copies of sealed ones."""
+    if not usable.any():
+        raise UserError(
+            f"{place} has only copies of sealed levels, which only serve to measure policies: choose others."
         )
 
 

@@ -1,6 +1,5 @@
 """Reinforcement learning of one policy over many levels, with checkpoints from which a run continues bit for bit."""
 
-import hashlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -20,7 +19,7 @@ from levelproof.experts.generalist.replay import replay
 from levelproof.experts.generalist.rollout import table_of
 from levelproof.experts.generalist.train import Learner, Programs, TrainingRecipe, UpdateFacts, programs_of
 from levelproof.experts.networks.over_levels import PolicyKind
-from levelproof.experts.networks.saved import WEIGHTS, Policy, policy_folder
+from levelproof.experts.networks.saved import Policy
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.sampling.sampler import Sampler
 from levelproof.levelgen.task.lanes import Table
@@ -36,13 +35,14 @@ from levelproof.pipeline.learn.folder import (
     require_finite,
     require_same_run,
     shown,
+    weights_digest,
     write_note,
 )
 from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.trained_on import TrainingLevels, levels_for
 from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.runtime import own_cores, prepare_jax
-from levelproof.pipeline.store.disk import explaining_writes, read_regular
+from levelproof.pipeline.store.disk import explaining_writes
 from levelproof.pipeline.store.locks import only_clone
 from levelproof.pipeline.words import duration
 
@@ -147,9 +147,12 @@ def curriculum_of(config: TrainConfig, levels: Level | Sampler, rules: TaskParam
 def note_of(config: TrainConfig, source: TrainingLevels, cores: int) -> dict[str, Any]:
     """Return what decides a run's result, as JSON."""
     settings = {name: value for name, value in plain(config).items() if name not in WITHOUT_EFFECT}
-    weights = policy_folder(config.start) / WEIGHTS
-    start = hashlib.sha256(read_regular(weights)).hexdigest() if config.start else None
-    return {"settings": settings, "levels": source.facts, "start": start, "cores": cores}
+    return {
+        "settings": settings,
+        "levels": source.facts,
+        "start": weights_digest(config.start),
+        "cores": cores,
+    }
 
 
 def update_until_done(

@@ -17,8 +17,7 @@ from levelproof.levelgen.sampling.sampler import Sampler, sampler
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.learn.measured import is_split, levels_in
-from levelproof.pipeline.learn.sealed import require_not_sealed, sealed_hashes
-from levelproof.pipeline.words import many
+from levelproof.pipeline.learn.sealed import require_not_sealed, require_some_usable, without_sealed
 
 
 class TrainingLevels(NamedTuple):
@@ -50,18 +49,11 @@ def levels_for(config: TrainConfig, tell: Callable[[str], None]) -> TrainingLeve
     (group,) = groups
     if split:
         require_not_sealed(place, group.level_ids)
-    sealed, hashes = sealed_hashes(group.levels.size), content_hashes(group.levels)
-    usable = np.array([each not in sealed for each in hashes])
-    if copies := int((~usable).sum()):
-        tell(
-            f"{place}: {many(copies, 'level')} left out: copies of sealed levels, which only serve to measure policies."
-        )
-    if not usable.any():
-        raise UserError(
-            f"{place} has only copies of sealed levels, which only serve to measure policies: choose others."
-        )
+    hashes = np.array(content_hashes(group.levels))
+    usable = without_sealed(place, hashes, group.levels.size, tell)
+    require_some_usable(place, usable)
     levels = jax.device_put(take(group.levels, np.flatnonzero(usable)))
-    digest = hashlib.sha256("".join(each for each in hashes if each not in sealed).encode()).hexdigest()[:16]
+    digest = hashlib.sha256("".join(hashes[usable]).encode()).hexdigest()[:16]
     facts = {"levels": str(place), "count": len(levels), "content": digest}
     return TrainingLevels(str(place), levels, group.rules, facts)
 
