@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 
 from levelproof.configs.clone import CloneConfig
 from levelproof.experts.imitation import Transitions
+from levelproof.experts.networks.over_levels import NetworkConfig
 from levelproof.levelgen.level import Level
 from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.dataset.order import EpochOrder
@@ -55,17 +56,28 @@ class PartedSplit(NamedTuple):
 def read_pool(
     data: Dataset,
     indices: Int[np.ndarray, " level"],
-    config: CloneConfig,
+    network: NetworkConfig,
+    whole: bool = False,
+    mirror: bool = False,
     follow: Callable[[int], None] = lambda _: None,
 ) -> LevelPool:
-    """Read levels into memory, and their mirror images if configured; `follow` is passed the number in each read."""
-    names = (*MOTION_FIELDS, *([CONTACTS] if config.network.reads_contacts else []))
+    """Read levels into memory, with what moves in their records.
+
+    Args:
+        data: the split.
+        indices: of the levels' trajectories.
+        network: decides whether contacts are read.
+        whole: read whole records, not only up to each one's first goal.
+        mirror: add the mirror images that solve their mirrored level.
+        follow: called with the number of levels in each read.
+    """
+    names = (*MOTION_FIELDS, *([CONTACTS] if network.reads_contacts else []))
 
     def read(some: Int[np.ndarray, " level"]) -> LevelPool:
         batch = data.read(some, fields=["level", *names], observation=None)
-        whole, fields = config.episodes == "all", [batch.fields[name] for name in names]
+        fields = [batch.fields[name] for name in names]
         pool = _cut(Witnesses(batch.level, fields, batch.done, batch.action), whole)
-        return _joined([pool, _cut(mirrored(batch, names, whole, data.rules), whole)]) if config.mirror else pool
+        return _joined([pool, _cut(mirrored(batch, names, whole, data.rules), whole)]) if mirror else pool
 
     with ThreadPoolExecutor(len(own_cores())) as threads:
         parts = []
@@ -135,7 +147,8 @@ class Feed:
         pools = []
         for source, order in zip(self._sources, self._orders, strict=True):
             items, _ = order.items(turn)  # an epoch's last round is padded with levels of the next epoch's first round
-            pools.append(read_pool(source.data, source.train[items], self._config, self._follow))
+            whole, mirror = self._config.episodes == "all", self._config.mirror
+            pools.append(read_pool(source.data, source.train[items], self._config.network, whole, mirror, self._follow))
         return pools
 
     def _draw(self, pools: Sequence[LevelPool], update: int) -> Transitions:
@@ -149,7 +162,7 @@ def validation_batches(source: PartedSplit, config: CloneConfig) -> list[Transit
     """Return whole batches of transitions of a split's validation levels, the same in every run."""
     rng = np.random.default_rng(config.seed)
     chosen = rng.permutation(source.validation)[:VALIDATED]
-    pool = read_pool(source.data, chosen, replace(config, mirror=False))
+    pool = read_pool(source.data, chosen, config.network, config.episodes == "all")
     levels = np.tile(np.arange(len(chosen)), DRAWN)
     batch = config.train.batch
     padded = np.resize(levels, -(-len(levels) // batch) * batch)

@@ -164,7 +164,7 @@ def test_bad_input_is_refused(split: Path, policy: Path, tmp_path: Path, monkeyp
 def test_transformer_learns_from_states_with_their_contacts(split: Path) -> None:
     config = CloneConfig(where="", network=NetworkConfig(PolicyKind.TRANSFORMER))
     data = module.source_of(split, config, print).data
-    pool = read_pool(data, np.arange(2), config)
+    pool = read_pool(data, np.arange(2), config.network, config.episodes == "all", config.mirror)
     state = from_motion(pool.motion[pool.first[1] :], data.size)
     stored = data.read([1], fields=["record/state"], observation=None).fields
     steps = int(pool.steps[1])
@@ -179,7 +179,7 @@ def test_transformer_learns_from_states_with_their_contacts(split: Path) -> None
 def test_pool_has_the_mirror_images_that_solve(split: Path) -> None:
     config = CloneConfig(where="label = 'solved'", mirror=True)
     data = module.source_of(split, replace(config, validation=0.3), print).data
-    plain_pool, pool = (read_pool(data, np.arange(len(data)), each) for each in (replace(config, mirror=False), config))
+    plain_pool, pool = (read_pool(data, np.arange(len(data)), config.network, mirror=each) for each in (False, True))
     count = len(plain_pool.steps)
     assert 1.5 * count < len(pool.steps) <= 2 * count
     assert len(pool.level) == len(pool.steps)
