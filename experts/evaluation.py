@@ -55,14 +55,14 @@ def do_nothing(params: Any, moment: Moment) -> Int[Array, "6 lane"]:
 
 def play_randomly(params: Any, moment: Moment) -> Int[Array, "6 lane"]:
     """Draw every entry uniformly."""
-    return _evenly(moment.uniform)
+    return evenly(moment.uniform)
 
 
 def play_sticky(params: Any, moment: Moment) -> Int[Array, "6 lane"]:
     """Repeat each entry of the previous action with probability STAY; else, and at the start, draw it uniformly."""
     fresh = moment.now.timestep == 0
     left = jnp.where(fresh, moment.uniform, (moment.uniform - STAY) / (1 - STAY))
-    return jnp.where(left >= 0, _evenly(left), moment.previous)
+    return jnp.where(left >= 0, evenly(left), moment.previous)
 
 
 @lru_cache(maxsize=16)
@@ -232,7 +232,8 @@ def _keys(level_ids: Int[Array, " level"], seed: Array, attempts: Int[Array, " a
     return jax.vmap(of_level)(level_ids).reshape(-1)
 
 
-def _evenly(uniform: Float[Array, "6 lane"]) -> Int[Array, "6 lane"]:
+def evenly(uniform: Float[Array, "6 lane"]) -> Int[Array, "6 lane"]:
+    """Return each entry's choice for a random number in [0, 1), all choices equally likely."""
     choices = jnp.array(CHOICES)[:, None]
     return jnp.minimum((uniform * choices).astype(jnp.int32), choices - 1)
 
