@@ -16,13 +16,14 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from levelproof.configs.convert import flat, plain, typed
+from levelproof.configs.convert import flat, nested, plain, typed
 from levelproof.configs.errors import ConfigError, suggestion, warn_of_name
 from levelproof.configs.schema import RENAMED, REPEATED, JobConfig, from_files, hash_of
 from levelproof.levelgen.sampling.distribution import Distribution
 
 if TYPE_CHECKING:
     from levelproof.configs.clone import CloneConfig
+    from levelproof.configs.distill import DistillConfig
     from levelproof.configs.train import TrainConfig
 
 T = TypeVar("T")
@@ -238,21 +239,41 @@ def compose_train(overrides: Sequence[str]) -> "TrainConfig":
             raise ConfigError(f"{name} has no effect with levels={config.levels}: leave it out.")
         if not config.start and name in ("ppo.critic_updates", "ppo.kl_weight", "ppo.kl_updates"):
             raise ConfigError(f"{name} has no effect without start: leave it out.")
-        if config.start and name.startswith("network."):
-            raise ConfigError(f"{name} is that of the policy to start from: leave it out, or leave out start.")
+    _require_no_network(config.start, parsed)
     if random and config.distribution not in distributions():
         hint = suggestion(config.distribution, distributions())
         raise ConfigError(f"there is no distribution {config.distribution}{hint}.")
     return config
 
 
+def compose_distill(overrides: Sequence[str]) -> "DistillConfig":
+    """Return the settings of `levelproof distill` that `overrides` (`key=value` strings) change.
+
+    Raises:
+        ConfigError: a setting is unknown, has a wrong value, or has no effect beside the others.
+    """
+    from levelproof.configs.distill import DistillConfig  # imports flax and optax
+
+    parsed = [_parse(text) for text in overrides]
+    config = _changed(DistillConfig, parsed)
+    _require_no_network(config.start, parsed)
+    return config
+
+
+def _require_no_network(start: str, overrides: Iterable[Override]) -> None:
+    """Raise ConfigError if settings change the network of a policy to start from."""
+    for override in overrides if start else ():
+        if (name := override.key_or_group).startswith("network."):
+            raise ConfigError(f"{name} is that of the policy to start from: leave it out, or leave out start.")
+
+
 def _changed(cls: type[T], overrides: Iterable[Override]) -> T:
     """Return a dataclass of settings with changes; it has no yaml file and no presets."""
-    known, nested = flat(plain(cls())), {}
+    known = flat(plain(cls()))
+    changed = dict(known)
     for override in overrides:
         key = override.key_or_group
         if key not in known:
             raise ConfigError(f"there is no setting {key}{suggestion(key, known)}: choose one of {', '.join(known)}.")
-        group, _, name = key.rpartition(".")
-        (nested.setdefault(group, {}) if group else nested)[name] = override.value()
-    return typed(cls, nested)
+        changed[key] = override.value()
+    return typed(cls, nested(changed))

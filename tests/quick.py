@@ -34,6 +34,7 @@ BRIEF = (
     "tests/pipeline/exchange/",
     "tests/pipeline/hostile/",
     "tests/pipeline/learn/test_clone",
+    "tests/pipeline/learn/test_distill",
     "tests/pipeline/learn/test_evaluate",
     "tests/pipeline/learn/test_train",
     "tests/pipeline/look/",

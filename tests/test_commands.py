@@ -31,6 +31,8 @@ def smaller(line: str) -> list[str]:
     if words[0] == "clone":
         words = [word for word in words if not word.startswith("train.")]
         words += ["train.updates=4", "train.batch=32", "validation=0.5", "where="]
+    if words[0] == "distill":
+        words += ["train.updates=4", "interval=2", "train.batch=32", "episodes=4", "states=4", "where="]
     if words[0] == "train":
         words = [word for word in words if not word.startswith("ppo.env")]
         words += ["ppo.environments=32", "ppo.env_steps=2048", "ppo.minibatches=4"]
@@ -78,7 +80,7 @@ def test_commands_of_a_page_run_in_order(page: Path, made: Path, tmp_path: Path)
         for name in re.findall(
             r"data/\w+/\w+|kinetix/\w+/\w+|level\.json|\bmine\b|\bhandmade\b|\bpolicy\b", " ".join(words)
         ):
-            makes = words[0] in ("import", "clone", "train") and f"-o {name}" in " ".join(words)
+            makes = words[0] in ("import", "clone", "train", "distill") and f"-o {name}" in " ".join(words)
             if (made / name).exists() and not (tmp_path / name).exists() and not makes:
                 copy = shutil.copytree if (made / name).is_dir() else shutil.copy
                 (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)

@@ -18,8 +18,8 @@ from levelproof.pipeline.urls import require_here, require_known, require_policy
 from levelproof.pipeline.version import __version__
 
 NAMES = (
-    "generate regenerate settings sample inspect columns plan diff show gallery play clone train evaluate export grow "
-    "import_ card status verify seal"
+    "generate regenerate settings sample inspect columns plan diff show gallery play clone train distill evaluate "
+    "export grow import_ card status verify seal"
 )
 # Checks of arguments that are paths; those of other names must not be URLs of an unsupported kind
 CHECKS = {"out": require_here, "plot": require_here, "policy": require_policy}

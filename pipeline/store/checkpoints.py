@@ -29,6 +29,7 @@ from levelproof.pipeline.store.manifest import changes_text, differences, read_m
 from levelproof.pipeline.store.remote import require_folder
 
 COPY = "make a copy of your own of the split that continue_from names, or leave continue_from out"
+RESTART = "leave out continue_from to train them from the start"
 T = TypeVar("T")
 
 
@@ -53,8 +54,8 @@ def save_experts(path: Path, experts: Mapping[int, KeptExpert]) -> None:
     flush(path)
 
 
-def load_experts(path: Path, job: JobConfig) -> dict[int, KeptExpert]:
-    """Load all experts of a checkpoint, by level id.
+def load_experts(path: Path, job: JobConfig, without: str = RESTART) -> dict[int, KeptExpert]:
+    """Load all experts of a checkpoint, by level id; `without` ends the message if they cannot be read.
 
     Raises:
         UserError: other users can write to it.
@@ -74,9 +75,7 @@ def load_experts(path: Path, job: JobConfig) -> dict[int, KeptExpert]:
         begun = unstacked(arrays, "begun/", begun_like(job), len(level_ids))
     except Exception as error:  # numpy and zipfile raise many kinds
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise Failure(
-            f"The experts in {path} cannot be read ({reason}): leave out continue_from to train them from the start."
-        ) from error
+        raise Failure(f"The experts in {path} cannot be read ({reason}): {without}.") from error
     return {i: kept(expert, curve) for i, expert, curve in zip(level_ids.tolist(), begun, curves, strict=True)}
 
 

@@ -1,0 +1,34 @@
+"""`levelproof distill`: train one policy on the labels that teachers give at its own states."""
+
+import argparse
+from pathlib import Path
+
+from levelproof.pipeline.errors import UserError
+
+SUMMARY = "train one policy on labels that teachers give at its own states"
+EXAMPLE = """\
+levelproof distill data/128k/s start=policy/ -o distilled/
+levelproof distill data/128k/s start=builtin:s witnesses=0 teachers.witness=0 teachers.random=0 -o distilled/"""
+HELP = "a split (folder or URL), and settings to change as NAME=VALUE; docs/distill.md lists them"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("words", nargs="+", metavar="SPLIT|NAME=VALUE", help=HELP)
+    out = "folder to write; the same command continues a run that was stopped (default: distilled)"
+    parser.add_argument("-o", "--out", type=Path, default=Path("distilled"), help=out)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    from rich.console import Console
+
+    from levelproof.configs.compose import compose_distill
+    from levelproof.pipeline.learn.distill import distill
+    from levelproof.pipeline.urls import require_known
+
+    settings = [word for word in arguments.words if "=" in word and not Path(word).exists()]
+    splits = [Path(word) for word in arguments.words if word not in settings]
+    if len(splits) != 1:
+        named = f"not {len(splits)}" if splits else "as in `levelproof distill data/128k/s`"
+        raise UserError(f"Distilling takes the levels of one split: name one, {named}.")
+    require_known(splits[0])
+    distill(splits[0], compose_distill(settings), arguments.out, Console(stderr=True))

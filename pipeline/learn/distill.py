@@ -1,0 +1,315 @@
+"""Imitation of teachers at the learner's own states, round after round (DAgger, Ross et al. 2011, arXiv:1011.0686).
+
+In a round, the learner plays, teachers label states of its episodes, and updates follow. Everything that decides how a
+run continues is in its checkpoint or follows from the settings and the round's number.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Int, Int8
+from rich.console import Console
+
+from levelproof.configs.convert import plain
+from levelproof.configs.distill import DistillConfig
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.evaluation import first_actions, play_sampled
+from levelproof.experts.generalist.teachers import (
+    AT_ONCE,
+    Asked,
+    KnownExperts,
+    Labels,
+    Teacher,
+    label_states,
+    no_experts,
+)
+from levelproof.experts.generalist.visited import draw_states, visit
+from levelproof.experts.imitation import Imitation, Likeness, Transitions, begin_imitation, imitate
+from levelproof.experts.labels import Label
+from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind
+from levelproof.experts.networks.saved import Policy
+from levelproof.levelgen.batching import blocks, take
+from levelproof.levelgen.identity.keys import key_of_seed
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.rules import TaskParams
+from levelproof.pipeline.dataset.dataset import Dataset
+from levelproof.pipeline.dataset.order import EpochOrder
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.jobs.progress import say
+from levelproof.pipeline.learn.curves import BLUE, GREEN, Curves, Panel
+from levelproof.pipeline.learn.folder import (
+    continued,
+    keep_run,
+    made,
+    require_finite,
+    require_same_run,
+    shown,
+    weights_digest,
+    write_note,
+)
+from levelproof.pipeline.learn.kept_experts import experts_of
+from levelproof.pipeline.learn.labelled import LabelBuffer, empty_labels, with_labels
+from levelproof.pipeline.learn.metrics import Metrics
+from levelproof.pipeline.learn.pool import LevelPool, read_pool
+from levelproof.pipeline.learn.sealed import require_not_sealed, require_some_usable, without_sealed
+from levelproof.pipeline.read.policies import policy_at, require_size
+from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store.disk import explaining_writes
+from levelproof.pipeline.store.locks import only_clone
+from levelproof.pipeline.words import duration
+
+COURSE = Curves(
+    "distill/updates",
+    "updates",
+    (
+        Panel("Episodes that reach the goal", {GREEN: "distill/solve_rate"}, 1.0),
+        Panel("States with a label", {BLUE: "distill/labelled"}, 1.0),
+    ),
+    {GREEN: "the learner's episodes", BLUE: "by a teacher"},
+)
+WITHOUT_EFFECT = ("log",)  # settings that a continued run may change
+ASKING = 7  # folded into the seed's key; `experts.generalist.train` takes 1 to 4
+
+
+class TaughtLevels(NamedTuple):
+    """The levels of a run, with what teachers know of them."""
+
+    split: Path
+    facts: dict[str, Any]  # what identifies them, as JSON
+    level_ids: Int[np.ndarray, " level"]
+    levels: Level  # with first states; on the host, level axis last
+    witnesses: LevelPool
+    experts: KnownExperts
+    rules: TaskParams
+
+    def witness_of(self, levels: Int[np.ndarray, " state"]) -> Int8[np.ndarray, "256 6 state"]:
+        """Return the witnesses of levels; the last action is repeated."""
+        pool = self.witnesses
+        row = pool.first[levels] + np.minimum(np.arange(RECORD_STEPS)[:, None], pool.steps[levels] - 1)
+        return np.moveaxis(pool.action[row], -1, 1)
+
+
+class Distillation(NamedTuple):
+    """Training under way, with all that decides how it continues."""
+
+    imitation: Imitation
+    labels: LabelBuffer
+
+
+class Answers(NamedTuple):
+    """What a round of questions finds out."""
+
+    level: Int[np.ndarray, " state"]  # index of each state's level
+    labels: Labels
+    solved: float  # share of the learner's episodes
+    env_steps: int  # of the learner and its teachers
+
+
+def distill(split: Path, config: DistillConfig, out: Path, console: Console) -> None:
+    """Train a policy on the labels of teachers, or continue to; write it to `out`, and print where it is.
+
+    Raises:
+        UserError: the split, the policy to start from or settings are unusable; `out` is unusable, in use or has
+            another run; no teacher labels any state; or a library is missing.
+        Failure: the data or the checkpoint is damaged.
+    """
+    prepare_jax()
+    tell = lambda text: say(console, text)
+    start = policy_at(Path(config.start)) if config.start else None
+    network = start.network if start else config.network
+    taught = levels_for(split, config, network, tell)
+    size = taught.levels.size
+    if start:
+        require_size(start, size, str(split), "start from one that plays any size")
+    note = note_of(taught, config)
+    with explaining_writes(out), only_clone(made(out)) as require_ours:
+        require_same_run(out, note)
+        params = start.params if start else None
+        columns = taught.witnesses.motion.shape[1]
+        fresh = Distillation(
+            begin_imitation(np.int32(config.seed), network, size, config.train, params),
+            empty_labels(config.buffer, columns),
+        )
+        now = continued(out, fresh)
+        now = now._replace(labels=jax.device_get(now.labels))
+        write_note(out, note)
+        metrics, done = Metrics(out, COURSE, config.log, note, int(now.imitation.updates), tell), False
+
+        def save(now: Distillation) -> None:
+            require_ours()
+            fits = size if network.kind is PolicyKind.FLAT else None
+            origin = note | {"updates": int(now.imitation.updates)}
+            origin |= {"start_origin": dict(start.origin)} if start else {}
+            keep_run(out, Policy(network, now.imitation.average, fits, origin), now)
+
+        try:
+            now = update_until_done(taught, config, network, now, save, metrics, console)
+            done = True
+        finally:
+            metrics.close(done)
+        save(now)
+    tell(f"The policy is in {out}. Next: levelproof evaluate {out}")
+
+
+def levels_for(split: Path, config: DistillConfig, network: NetworkConfig, tell: Callable[[str], None]) -> TaughtLevels:
+    """Read the levels of a split that have a witness and are not trivial; leave out copies of sealed levels.
+
+    Raises:
+        UserError: the split is unusable, has sealed ids, or no usable level.
+        Failure: its data is damaged.
+    """
+    data = Dataset(split, config.where or None, (), 0.0)
+    ids = data.manifest["level_id"].to_numpy()
+    require_not_sealed(split, ids)
+    usable = without_sealed(split, data.content_hashes, data.size, tell)
+    require_some_usable(split, usable)
+    trivial = np.array([label == Label.TRIVIAL for label in data.manifest["label"].to_pylist()])
+    if not (usable & ~trivial).any():
+        raise UserError(f"{split} has only trivial levels that meet the condition: choose others with where.")
+    chosen = np.flatnonzero(usable & ~trivial)
+    if len(chosen) > config.pool:
+        chosen = np.sort(np.random.default_rng(config.seed).choice(chosen, config.pool, replace=False))
+    tell(f"Reading {len(chosen):,} levels")
+    facts = {
+        "split": str(split),
+        "levels": len(chosen),
+        "ids": data.fingerprint,
+        "copies_of_sealed": int((~usable).sum()),
+    }
+    experts = experts_of(split, ids[chosen]) if config.teachers.expert else no_experts(len(chosen))
+    if not (experts.config or config.teachers.searches):
+        raise UserError(
+            f"{split} kept no experts of these levels, and no other teacher is asked: set teachers.random above 0, or "
+            "make the split with keep_experts=true."
+        )
+    return TaughtLevels(
+        split, facts, ids[chosen], data.levels(chosen), read_pool(data, chosen, network), experts, data.rules
+    )
+
+
+def note_of(taught: TaughtLevels, config: DistillConfig) -> dict[str, Any]:
+    """Return what decides a run's result, as JSON."""
+    settings = {name: value for name, value in plain(config).items() if name not in WITHOUT_EFFECT}
+    return {"splits": [taught.facts], "settings": settings, "start": weights_digest(config.start)}
+
+
+def update_until_done(
+    taught: TaughtLevels,
+    config: DistillConfig,
+    network: NetworkConfig,
+    now: Distillation,
+    save: Callable[[Distillation], None],
+    metrics: Metrics,
+    console: Console,
+) -> Distillation:
+    """Take the rounds that are left; `save` the state and write metrics after each.
+
+    Raises:
+        UserError: no state has a label, and no witness is learned from.
+        Failure: the weights have diverged.
+    """
+    last, first = config.train.updates, int(now.imitation.updates)
+    before, began = metrics.last.get("distill/core_seconds", 0.0), time.monotonic()
+    with shown(console, "compiling", last, first) as show:
+        for update in range(first, last, config.interval):
+            show(0, f"{update:,}/{last:,} updates · asking teachers about {config.states} states")
+            asked = ask(taught, config, network, now.imitation, update // config.interval)
+            now = now._replace(labels=with_labels(now.labels, asked.level, asked.labels, config.path))
+            if not now.labels.filled and not config.witnesses:
+                raise UserError(
+                    f"No teacher reached the goal from any of {config.states} states: set witnesses above 0, or raise "
+                    "states or teachers.random."
+                )
+            until = min(update + config.interval, last)
+            now, recent = learn(taught, config, network, now, until)
+            numbers = numbers_of(asked, recent, until)
+            numbers["distill/core_seconds"] = before + time.process_time()
+            require_finite(numbers["distill/loss"], "train.learning_rate")
+            words = (
+                f"{until:,}/{last:,} updates · {asked.solved:.1%} solved · {numbers['distill/labelled']:.1%} of states "
+                "labelled"
+            )
+            if update == first:
+                began = time.monotonic()  # compiling does not count
+            else:
+                pace = (time.monotonic() - began) / (until - first - config.interval)
+                words += f" · about {duration((last - until) * pace)} left"
+            show(until - update, words)
+            save(now)
+            metrics.write(numbers)
+            say(console, words)
+    return now
+
+
+def ask(
+    taught: TaughtLevels, config: DistillConfig, network: NetworkConfig, learner: Imitation, number: int
+) -> Answers:
+    """Let the learner play, and ask teachers about states of its episodes; `number` is the round's."""
+    rng = np.random.default_rng([config.seed, number, ASKING])
+    count = len(taught.level_ids)
+    chosen, _ = EpochOrder(count, min(count, config.episodes), config.seed).items(number)
+    levels, ids = take(taught.levels, chosen), taught.level_ids[chosen].astype(np.int32)
+    seed = int(rng.integers(2**31))
+    action = first_actions(play_sampled(network), learner.average, levels, ids, seed, taught.rules)
+    whole: Any = jax.device_get(visit(levels, action, np.zeros(len(ids), np.int32), taught.rules))
+    episode, at = draw_states(rng, whole.steps, whole.solved, config.states, config.failed)
+    parts = []
+    for some in blocks(len(at), AT_ONCE):
+        of_block = take(levels, episode[some]), action[..., episode[some]], at[some]
+        parts.append(jax.device_get(visit(*of_block, taught.rules)).now)
+    states = take(jax.tree.map(lambda *xs: np.concatenate(xs, -1), *parts), np.arange(len(at)))
+    level = chosen[episode]
+    asked = Asked(take(levels, episode), states, taught.witness_of(level))
+    key = jax.random.fold_in(jax.random.fold_in(key_of_seed(config.seed), ASKING), number)
+    labels = label_states(asked, taught.experts.of(level), learner.average, network, config.teachers, key, taught.rules)
+    return Answers(level, labels, float(whole.solved.mean()), int(whole.steps.sum()) + labels.env_steps)
+
+
+def learn(
+    taught: TaughtLevels, config: DistillConfig, network: NetworkConfig, now: Distillation, until: int
+) -> tuple[Distillation, list[Likeness]]:
+    """Take the updates below number `until`; return the likeness before each."""
+    imitation, recent = now.imitation, []
+    for batch in batches(taught, now.labels, config, range(int(imitation.updates), until)):
+        imitation, likeness = imitate(imitation, batch, network, config.train)
+        recent.append(jax.device_get(likeness))
+    return now._replace(imitation=imitation), recent
+
+
+def batches(taught: TaughtLevels, labels: LabelBuffer, config: DistillConfig, updates: range) -> Iterator[Transitions]:
+    """Yield the batches of these updates: transitions of witnesses and of teachers."""
+    total, rows = config.train.batch, labels.filled
+    shown_by_witnesses = round(total * config.witnesses) if rows else total
+    for update in updates:
+        rng = np.random.default_rng([config.seed, update])
+        mine = rng.integers(0, len(taught.level_ids), shown_by_witnesses)
+        drawn = taught.witnesses.draw(rng, mine)
+        row = rng.integers(0, max(rows, 1), total - shown_by_witnesses)
+        yield Transitions(
+            take(taught.witnesses.level, np.concatenate([mine, labels.level[row]])),
+            np.concatenate([drawn.motion, labels.motion[row]]),
+            np.concatenate([drawn.action, labels.action[row].astype(np.int32)]),
+        )
+
+
+def numbers_of(asked: Answers, recent: Sequence[Likeness], update: int) -> dict[str, float]:
+    """Return the metrics of a round and its updates."""
+    labels, count = asked.labels, len(asked.level)
+    by = {f"distill/by_{each.name.lower()}": int((labels.teacher == each).sum()) for each in Teacher if each}
+    labelled = labels.length > 0
+    return {
+        COURSE.step: update,
+        "distill/solve_rate": asked.solved,
+        "distill/asked": count,
+        **by,
+        "distill/none": int((~labelled).sum()),
+        "distill/labelled": float(labelled.mean()),
+        "distill/steps_to_goal": float(labels.length[labelled].mean()) if labelled.any() else np.nan,
+        "distill/env_steps": asked.env_steps,
+        "distill/loss": float(np.mean([each.loss for each in recent])),
+        "distill/accuracy": float(np.mean([each.accuracy for each in recent])),
+    }

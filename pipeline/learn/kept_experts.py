@@ -1,0 +1,50 @@
+"""The experts that a split kept (`keep_experts`), as teachers of its levels."""
+
+from collections import defaultdict
+from pathlib import Path
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from levelproof.configs.convert import typed
+from levelproof.configs.schema import JobConfig
+from levelproof.experts.config import ExpertConfig
+from levelproof.experts.generalist.teachers import KnownExperts, no_experts
+from levelproof.pipeline.read.levels import recorded_settings
+from levelproof.pipeline.store.checkpoints import load_experts
+from levelproof.pipeline.store.layout import data_path
+from levelproof.pipeline.store.manifest import require_manifest
+from levelproof.pipeline.store.remote import is_remote
+from levelproof.pipeline.store.seed.file import is_seed
+
+WITHOUT = "set teachers.expert=0 to do without them"
+
+
+def experts_of(split: Path, level_ids: Int[np.ndarray, " level"]) -> KnownExperts:
+    """Load the experts of these levels; of a split by URL and of seeds none.
+
+    Raises:
+        UserError: other users can write to the experts.
+        Failure: they are damaged or missing, or another version wrote them.
+    """
+    if is_remote(split) or is_seed(split):
+        return no_experts(len(level_ids))
+    manifest = require_manifest(split, ["experts", "size"], level_ids)
+    rows = manifest.table.to_pylist()
+    by_file: dict[str, list[int]] = defaultdict(list)
+    for row in rows:
+        if row["experts"]:
+            by_file[row["experts"]].append(row["level_id"])
+    if not by_file:
+        return no_experts(len(level_ids))
+    with recorded_settings(split):
+        config = typed(ExpertConfig, (manifest.config or {})["expert"], "expert")
+        job = JobConfig(size=rows[0]["size"], expert=config)
+    params = {}
+    for name, ids in by_file.items():
+        experts = load_experts(data_path(split, name), job, WITHOUT)
+        params |= {i: experts[i].begun.training.train_state.params for i in ids if i in experts}
+    row_of = {level_id: row for row, level_id in enumerate(params)}
+    expert = np.array([row_of.get(level_id, -1) for level_id in level_ids.tolist()])
+    return KnownExperts(config, jax.tree.map(lambda *xs: np.stack(xs), *params.values()), expert)

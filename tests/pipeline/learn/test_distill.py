@@ -1,0 +1,227 @@
+"""Distilling a policy from teachers on a small real split, and continuing to the same bytes."""
+
+import json
+import shutil
+from dataclasses import is_dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+import levelproof
+from levelproof.configs.compose import compose_distill, override_of
+from levelproof.configs.convert import plain
+from levelproof.configs.distill import DistillConfig
+from levelproof.configs.meanings import comments_in
+from levelproof.experts.generalist.teachers import Labels
+from levelproof.experts.labels import Label
+from levelproof.experts.networks.over_levels import NetworkConfig
+from levelproof.experts.verdict.judge import KeptExpert
+from levelproof.pipeline.learn import distill as module
+from levelproof.pipeline.learn import kept_experts, sealed
+from levelproof.pipeline.learn.kept_experts import experts_of
+from levelproof.pipeline.learn.labelled import empty_labels, with_labels
+from levelproof.pipeline.store.checkpoints import begun_like, save_experts
+from levelproof.pipeline.store.layout import EXPERTS
+from tests.pipeline.command import ROOT, assert_refused, here
+from tests.pipeline.made import made_job
+
+TINY = ("network.width=8", "network.depth=1", "network.heads=1")
+ROUNDS = ("train.updates=6", "interval=2", "train.batch=32", "episodes=8", "states=16", "buffer=64")
+TEACHERS = ("teachers.witness=2", "teachers.random=8", "teachers.learner=1")
+FILES = ("policy.safetensors", "checkpoint.safetensors", "config.json")
+
+
+def distilled(folder: Path, split: Path, *words: str) -> Path:
+    folder.mkdir(exist_ok=True)
+    done = here(["distill", str(split), "-o", "policy", *ROUNDS, *TEACHERS, *words], folder)
+    assert done.returncode == 0, done.stderr
+    return folder / "policy"
+
+
+def metrics(out: Path) -> list[dict[str, float]]:
+    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def policy(split: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return distilled(tmp_path_factory.mktemp("distilled"), split, *TINY)
+
+
+def test_every_state_has_a_teacher_or_none(policy: Path) -> None:
+    curve = metrics(policy)
+    assert [line["distill/updates"] for line in curve] == [2, 4, 6]
+    for line in curve:
+        by = [line[f"distill/by_{name}"] for name in ("expert", "witness", "random", "learner")]
+        assert sum(by) + line["distill/none"] == line["distill/asked"] == 16
+        assert by[0] == 0, "the split kept no experts"
+        assert line["distill/env_steps"] > 0
+    assert sum(line["distill/labelled"] for line in curve) > 0
+
+
+def test_folder_holds_a_policy_with_its_origin(policy: Path, split: Path) -> None:
+    loaded = levelproof.load_policy(policy)
+    assert loaded.size is None
+    assert loaded.origin["updates"] == 6
+    assert loaded.origin["splits"][0]["split"] == str(split)
+    assert (policy / "curves.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_run_that_was_stopped_continues_bit_for_bit(
+    policy: Path, split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keep = module.keep_run
+
+    def stopped(*arguments: Any) -> None:
+        keep(*arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "keep_run", stopped)
+    here(["distill", str(split), "-o", "policy", *ROUNDS, *TEACHERS, *TINY], tmp_path)
+    assert load_file(tmp_path / "policy/checkpoint.safetensors")[".imitation.updates"] == 2
+    monkeypatch.undo()
+    out = distilled(tmp_path, split, *TINY)
+    for name in FILES:
+        assert (out / name).read_bytes() == (policy / name).read_bytes()
+    mine, theirs = (metrics(folder)[-1] | {"distill/core_seconds": 0.0} for folder in (out, policy))
+    assert mine == theirs
+
+
+def test_start_gives_weights_and_network(
+    policy: Path, split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "update_until_done", lambda taught, config, network, now, *_: now)
+    out = distilled(tmp_path, split, f"start={policy}")
+    before, after = ((folder / "policy.safetensors").read_bytes() for folder in (policy, out))
+    assert before == after
+    assert levelproof.load_policy(out).origin["start_origin"] == levelproof.load_policy(policy).origin
+
+
+def labels_of(lengths: list[int], columns: int = 2) -> Labels:
+    """Return labels whose motion and actions say which state and env step they are of."""
+    steps, states = np.meshgrid(np.arange(256), np.arange(len(lengths)), indexing="ij")
+    action = np.repeat(steps[:, None] % 100, 6, 1).astype(np.int8)
+    motion = np.resize(np.stack([steps, states], -1), (*steps.shape, columns)).astype(np.float32)
+    return Labels(np.array(lengths) > 0, np.array(lengths), action, motion, 0)
+
+
+def test_buffer_keeps_the_latest_transitions_and_none_without_a_label() -> None:
+    level = np.array([7, 8, 9])
+    buffer = with_labels(empty_labels(8, 2), level, labels_of([50, 0, 2]), 3)
+    assert buffer.filled == 5
+    assert buffer.level[:5].tolist() == [7, 7, 7, 9, 9]
+    assert buffer.motion[:5, 0].tolist() == [0, 24, 49, 0, 1]
+    assert buffer.action[:5, 0].tolist() == [0, 24, 49, 0, 1]
+    later = with_labels(buffer, level, labels_of([0, 90, 1]), 3)
+    assert later.filled == 8
+    assert later.level.tolist() == [9, 7, 7, 9, 9, 8, 8, 8]
+    assert with_labels(later, level, labels_of([0, 0, 0]), 3).added == later.added
+    alone = with_labels(empty_labels(8, 2), level, labels_of([50, 3, 2]), 1)
+    assert alone.motion[:3].tolist() == [[0, 0], [0, 1], [0, 2]]
+    assert with_labels(empty_labels(2, 2), level, labels_of([50, 3, 2]), 3).level.tolist() == [9, 9]
+
+
+def test_run_without_any_label_says_so(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "label_states", lambda asked, *_: labels_of([0] * 16, 6 * asked.level.size.bodies))
+    done = here(["distill", str(split), "-o", "policy", *ROUNDS, *TINY, "witnesses=0"], tmp_path)
+    assert_refused(done, 2, "No teacher reached the goal from any of 16 states")
+
+
+def test_experts_that_a_split_kept_are_those_of_their_levels(
+    split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job, ids = made_job("data", "size=s"), np.arange(5)
+    name = f"{EXPERTS}/000000000000-000000000004-0123456789abcdef.npz"
+    marked = lambda i: jax.tree.map(lambda x: np.full_like(x, i), begun_like(job))
+    save_experts(tmp_path / "experts.npz", {i: KeptExpert(marked(i), [0.5]) for i in (1, 3)})
+    rows = [{"level_id": i, "size": "s", "experts": name if i in (1, 3) else None} for i in ids.tolist()]
+    manifest = kept_experts.require_manifest(split, ["experts", "size"], ids)
+    table = manifest.table.from_pylist(rows)
+    monkeypatch.setattr(kept_experts, "require_manifest", lambda *_: _With(table, manifest.config))
+    monkeypatch.setattr(kept_experts, "data_path", lambda *_: tmp_path / "experts.npz")
+    known = experts_of(split, ids)
+    assert known.config == job.expert
+    assert (known.expert >= 0).tolist() == [False, True, False, True, False]
+    leaf = jax.tree.leaves(known.params)[0]
+    assert [np.unique(leaf[known.expert[i]]).tolist() for i in (1, 3)] == [[1], [3]]
+    (tmp_path / "experts.npz").write_bytes(b"")
+    with pytest.raises(levelproof.Failure, match=r"cannot be read .*: set teachers.expert=0"):
+        experts_of(split, ids)
+
+
+class _With:
+    """A manifest of this table."""
+
+    def __init__(self, table: Any, config: Any) -> None:
+        self.table, self.config = table, config
+
+
+def test_levels_are_witnessed_and_neither_trivial_nor_sealed(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config, messages = DistillConfig(), []
+    taught = module.levels_for(split, config, NetworkConfig(), messages.append)
+    data = levelproof.open(split, where="label = 'solved'")
+    ids = data.manifest["level_id"].to_numpy()
+    assert np.array_equal(taught.level_ids, ids)
+    witness = taught.witness_of(np.arange(3))
+    stored = data.read(np.arange(3), observation=None)
+    for i in range(3):
+        first = int(np.argmax(stored.done[i])) + 1
+        assert np.array_equal(witness[:first, :, i], stored.action[i, :first])
+        assert (witness[first:, :, i] == stored.action[i, first - 1]).all()
+    few = module.levels_for(split, DistillConfig(pool=3), NetworkConfig(), print)
+    assert len(few.level_ids) == len(few.levels) == len(few.witnesses.steps) == 3
+    monkeypatch.setattr(module, "Label", type("Trivial", (), {"TRIVIAL": Label.SOLVED}))
+    with pytest.raises(levelproof.UserError, match="only trivial levels"):
+        module.levels_for(split, config, NetworkConfig(), print)
+    monkeypatch.undo()
+    monkeypatch.setattr(sealed, "SEALED", range(int(ids[0]), int(ids[0]) + 1))
+    with pytest.raises(levelproof.UserError, match="sealed to measure policies"):
+        module.levels_for(split, config, NetworkConfig(), print)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ([], "Distilling takes the levels of one split: name one, as in"),
+        (["one", "two"], "name one, not 2"),
+        (["none"], "none"),
+        (["SPLIT", "stats=3"], "did you mean states?"),
+        (["SPLIT", "start=none"], "There is no policy in none"),
+        (["SPLIT", "start=policy", "network.width=8"], "network.width is that of the policy to start from"),
+        (["SPLIT", "witnesses=1"], "witnesses is 1"),
+        (["SPLIT", "failed=2"], "failed is 2"),
+        (["SPLIT", "teachers.witness=0", "teachers.random=0", "teachers.learner=0"], "kept no experts"),
+        (["SPLIT", "teachers.random=-1"], "teachers.random is -1"),
+        (["SPLIT", "where=level_id < 0"], "has no trajectories for which level_id < 0"),
+        (["SPLIT", "-o", "file"], "Cannot write a policy to file"),
+    ],
+)
+def test_bad_input_is_refused_in_one_sentence(words: list[str], sentence: str, split: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    words = [str(split) if word == "SPLIT" else word for word in words]
+    assert_refused(here(["distill", *(words or ["states=4"])], tmp_path), 2, sentence)
+    assert not (tmp_path / "distilled").exists()
+
+
+def test_folder_of_another_run_is_refused(policy: Path, split: Path, tmp_path: Path) -> None:
+    shutil.copytree(policy, tmp_path / "policy")
+    done = here(["distill", str(split), "-o", "policy", *ROUNDS, *TEACHERS, *TINY, "seed=1"], tmp_path)
+    assert_refused(done, 2, "has a run with other settings or levels")
+
+
+def test_a_changed_setting_keeps_the_other_defaults_of_its_group() -> None:
+    """The defaults of `train` are not those of cloning."""
+    train = compose_distill(["train.updates=3"]).train
+    assert (train.updates, train.learning_rate) == (3, DistillConfig().train.learning_rate)
+
+
+def test_guide_lists_every_setting_with_its_default_and_meaning() -> None:
+    guide, config = (ROOT / "docs/distill.md").read_text(), DistillConfig()
+    for path, group in {"": config, "teachers.": config.teachers, "train.": config.train}.items():
+        for name, comment in comments_in(type(group)).items():
+            value = getattr(group, name)
+            if not is_dataclass(value):
+                assert f"| `{override_of(path + name, plain(value))}` | {comment.beside} |" in guide
