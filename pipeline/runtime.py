@@ -1,4 +1,4 @@
-"""JAX's setup in a process that runs work units: one thread, and compiled code cached for the next process.
+"""JAX's setup in a process that runs work units: a thread for each worker, and programs cached for the next process.
 
 Takes effect only before JAX starts its backend.
 """
@@ -23,8 +23,8 @@ XLA_FLAGS = (
     "--xla_cpu_multi_thread_eigen=false",
     "--xla_cpu_prefer_vector_width=512",  # ignored if the processor lacks such vectors
 )
-# NPROC and PJRT_NPROC set the size of XLA's pool; numpy's libraries read the others.
-THREADS = ("NPROC", "PJRT_NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+XLA_THREADS = "NPROC", "PJRT_NPROC"  # size of XLA's pool
+NUMPY_THREADS = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 NO_GPU = "JAX cannot use one here, which needs levelproof's extra `gpu`"
 LAST_CHECK = "looked"  # file beside the programs, touched when a check begins; programs older than it were readable
 CLAIM_SECONDS = 2.0  # s for which a worker tries to claim a core
@@ -57,7 +57,9 @@ def cache_folder() -> Path:
     return own_folder(path, f"delete it, or set {CACHE_VARIABLE} to a folder of your own")
 
 
-def prepare_jax(core: int | None = None, device: Literal["cpu", "gpu"] | None = None, devices: int = 1) -> None:
+def prepare_jax(
+    core: int | None = None, device: Literal["cpu", "gpu"] | None = None, devices: int = 1, threads: int = 1
+) -> None:
     """Set this process up to run work units, or to train a policy.
 
     Args:
@@ -65,6 +67,7 @@ def prepare_jax(core: int | None = None, device: Literal["cpu", "gpu"] | None = 
         device: "cpu": JAX ignores GPUs; "gpu": JAX uses a GPU if it can; None: JAX_PLATFORMS decides, by default the
             CPU.
         devices: devices that JAX shows for the CPU, each with a thread of its own.
+        threads: threads of this process that run programs at the same time; with too few, they wait for each other.
 
     Raises:
         UserError: see `cache_folder`.
@@ -72,7 +75,8 @@ def prepare_jax(core: int | None = None, device: Literal["cpu", "gpu"] | None = 
     flags = os.environ.get("XLA_FLAGS", "")
     wanted = [*XLA_FLAGS, *[f"--xla_force_host_platform_device_count={devices}"] * (devices > 1)]
     os.environ["XLA_FLAGS"] = " ".join([flags, *(flag for flag in wanted if flag not in flags)]).strip()
-    os.environ.update(dict.fromkeys(THREADS, "1"))
+    os.environ.update(dict.fromkeys(XLA_THREADS, str(threads)))
+    os.environ.update(dict.fromkeys(NUMPY_THREADS, "1"))
     if core is not None and sys.platform == "linux":  # other systems have no affinity
         for thread in os.listdir("/proc/self/task"):  # all threads of this process; later ones inherit the affinity
             os.sched_setaffinity(int(thread), {core})

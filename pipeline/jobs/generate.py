@@ -23,7 +23,7 @@ from levelproof.pipeline.jobs.progress import Board, Tally, say
 from levelproof.pipeline.jobs.schedule import Scheduler, UnitOutcome, WorkUnit, levels_text, schedule
 from levelproof.pipeline.jobs.seal import Sealer, sealing
 from levelproof.pipeline.read.level_files import Listing, levels_below
-from levelproof.pipeline.runtime import cache_folder, prepare_jax
+from levelproof.pipeline.runtime import cache_folder, own_cores, prepare_jax
 from levelproof.pipeline.stopping import Stop, stoppable
 from levelproof.pipeline.store import quarantine
 from levelproof.pipeline.store.checkpoints import require_same_experts
@@ -98,7 +98,7 @@ def generate_from_files(job: JobConfig, command: Sequence[str], console: Console
     """
     folder = Path(job.level_files).expanduser()
     if job.executor == "inline":
-        prepare_jax(device=job.device)
+        prepare_jax(device=job.device, threads=len(own_cores()))
         listing = levels_below(folder, job)
     else:
         listing = _list_in_subprocess(folder, job)

@@ -29,7 +29,8 @@ class Handle(NamedTuple):
 
 def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board: Board, stop: Stop) -> None:
     """Run all units in this process, or until a stop is requested."""
-    prepare_jax(device=job.device)
+    count = workers_here(job, scheduler.waiting)
+    prepare_jax(device=job.device, threads=count)
     if job.device == "gpu" and not jax_sees_a_gpu():
         board.say(f"This process uses a CPU core, not a GPU: {NO_GPU}.")
     # These modules read JAX's settings on import, so import them after JAX is set up
@@ -37,7 +38,6 @@ def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board
     from levelproof.pipeline.jobs.workers import worker_for
 
     with stop.heeded():
-        count = workers_here(job, scheduler.waiting)
         workers = {Handle(number): worker_for(job, split) for number in range(count)}
         first = next(iter(workers.values()))
         threads = min(len(own_cores()), MAX_THREADS)
