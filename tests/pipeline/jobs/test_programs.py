@@ -1,5 +1,6 @@
 """Programs of a job, known from its settings alone."""
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from levelproof.experts.pool.programs import Program, programs_of
 from levelproof.experts.pool.run import TrainingRun
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.physics.codegen.compile import NAME
 from levelproof.pipeline.claims import try_claim
 from levelproof.pipeline.jobs.ahead import DONE, Ahead
 from levelproof.pipeline.jobs.unit import pool_for
@@ -100,6 +102,17 @@ def test_programs_without_optimiser_multiply_no_floats(programs: list[Program]) 
         traced = program.function.program.trace(*arguments, **settings)
         rounding = {equation.primitive.name for equation in equations(traced.jaxpr) if of_floats(equation)}
         assert not rounding & {"mul", "dot_general", "exp", "log", "sin", "cos", "tanh", "erf_inv"}, program.name
+
+
+def test_programs_call_no_code_but_ours(programs: list[Program]) -> None:
+    """LAPACK's factorisations wait for XLA's pool from within it, which is deadly where two workers share a process."""
+    called = set[str]()
+    for program in programs:
+        program.prepare()
+        for compiled in program.function._programs.values():
+            called |= set(re.findall(r'custom_call_target="([^"]+)"', compiled.as_text()))
+    assert called
+    assert all(name.startswith(NAME) for name in called), called
 
 
 def of_floats(equation: Any) -> bool:
