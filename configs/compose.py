@@ -83,7 +83,10 @@ def presets() -> dict[str, list[str]]:
 
 @cache
 def shortest_command(job: JobConfig) -> str:
-    """Return the shortest command with the same results as `job`, without `out` and the choice of levels."""
+    """Return the shortest command with the same results as `job`, without `out` and the choice of levels.
+
+    It has the fewest settings; of commands with equally many, the one that names more presets.
+    """
     fixed, wanted, default = [f"budget={job.budget}"], flat(job.results), flat(_default().results)
     if not job.level_files:
         fixed.insert(0, f"size={job.size}")
@@ -94,8 +97,9 @@ def shortest_command(job: JobConfig) -> str:
         start = default | {key: value for preset in named.items() for key, value in _changes(*preset).items()}
         changed = [key for key, value in wanted.items() if key not in NOT_COPIED and start[key] != value]
         overrides = [override_of(key, wanted[key]) for key in changed]
-        commands.append(shlex.join(["levelproof", "generate", *fixed, *chosen, *overrides]))
-    return min(commands, key=len)
+        command = shlex.join(["levelproof", "generate", *fixed, *chosen, *overrides])
+        commands.append((len(chosen) + len(overrides), len(overrides), command))
+    return min(commands)[-1]
 
 
 def changed_settings(results: Mapping[str, Any]) -> list[str]:

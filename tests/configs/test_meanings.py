@@ -69,5 +69,5 @@ def test_overrides_of_all_defaults_compose_the_default_job() -> None:
 def test_setting_text_lists_choices_that_the_meaning_lacks() -> None:
     text = {setting.name: setting.text for setting in SETTINGS}
     assert "flat: all features in one vector; entity: " in text["expert.network"]
-    assert text["procedure"].endswith("(default, label, masters, published)")
+    assert text["procedure"].endswith("(default, label, masters, published, thorough)")
     assert "(auto, ray, inline)" not in text["executor"]

@@ -80,7 +80,10 @@ def test_version_prints_the_version(tmp_path: Path) -> None:
         (["size=xl"], ["size is 'xl'", "choose one of s, m, l"]),
         (["budget=0"], ["budget is '0'", "at least 1"]),
         (["budget=1000"], ["2048"]),
-        (["procedure=never"], ["there is no procedure never", "choose one of default, label, masters, published"]),
+        (
+            ["procedure=never"],
+            ["there is no procedure never", "choose one of default, label, masters, published, thorough"],
+        ),
         (["stop=budget"], ["stop is 'budget', but must be a group of settings"]),
         (["stop.rule=never"], ["stop.rule", "never"]),
         (["levels=abc"], ["levels is 'abc'", "64k"]),
