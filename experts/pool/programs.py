@@ -12,7 +12,7 @@ from levelproof.experts.config import RECORD_STEPS, Rule
 from levelproof.experts.pool import rework, strengthen
 from levelproof.experts.pool.pool import GROUP, Pool, slot_count
 from levelproof.experts.search import explore, vary
-from levelproof.experts.search.search import explored, side_by_side, varied
+from levelproof.experts.search.search import ALONE, explored, side_by_side, varied
 from levelproof.experts.search.shorten import shorten
 from levelproof.experts.training.advance import advance
 from levelproof.experts.training.slots import Pending, begin, slots_of
@@ -63,13 +63,13 @@ def searching(pool: Pool, size: Size) -> list[Program]:
     nearest = cache(lambda: vary.nearest_of.eval_shape(first().archive))
     by_name = {"config": endless, "rules": rules}
     again = cache(lambda: vary.begin.eval_shape(*some, nearest(), **by_name))
-    success = lambda: explored.eval_shape(first(), **ends)[1].success
+    alone = at_once(config.lanes, ALONE)
     always = [
         Program(explore.begin, lambda: ((*some, endless, rules), {})),
         Program(explored, lambda: ((first(),), ends)),
         entering(first, width, "search"),
         Program(explore.explore_rounds, lambda: ((first(), config.ends, endless, rules), {})),
-        Program(shorten, lambda: ((*some, success(), endless, rules), {})),
+        Program(shorten, lambda: ((levels_of(size, alone), ids_of(alone), no_success(alone), endless, rules), {})),
     ]
     variations = [
         Program(vary.nearest_of, lambda: ((first().archive,), {})),

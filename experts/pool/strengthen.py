@@ -58,7 +58,7 @@ def strengthen(
         active = ~now.robust
         new = edits(variation, now.code, now.length, draw(Draws.STRENGTHEN, level_ids, now.number, 10, LANES), ring)
         new = new.at[:, 0].set(now.code)
-        steps, _ = replayed(ring, new, jnp.where(active, now.length, 0), rules)
+        steps, _ = replayed(ring, new, jnp.where(active, now.length, 0), rules, KEPT)
         kept = jnp.argsort(jnp.where(lane, steps * LANES + lane, 0), axis=-1)[:, :KEPT]
         new, steps = jnp.take_along_axis(new, kept[..., None], 1), jnp.take_along_axis(steps, kept, 1)
         reached = steps <= RECORD_STEPS

@@ -26,6 +26,7 @@ from levelproof.levelgen.programs import jit_stored
 from levelproof.levelgen.task.rules import TaskParams
 
 IN_CACHE = 256  # lanes: their physics and archives fit the cache of a core
+ALONE = 1  # lane: on a CPU each success is shortened alone, because together the shorter ones wait for the longest
 AHEAD = 8  # levels that wait per search slot: about a second's work, so that no slot is empty until more arrive
 
 
@@ -112,7 +113,7 @@ class Searching:
     def result(self, job: SearchJob) -> SearchResult:
         """Return a finished job's results: shortened successes, verified by replay."""
         assert not job.under_way
-        results, width = job.known, side_by_side(self.config)
+        results, width = job.known, at_once(self.config.lanes, ALONE)
         indices = np.flatnonzero(results.success.length)
         for block in blocks(len(indices), width):
             some = indices[block]

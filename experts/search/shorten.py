@@ -18,7 +18,7 @@ from levelproof.experts.search.edit import Draws, draw, edits, shortening, varia
 from levelproof.experts.search.play import Arena, Walk, act, arena, best_lane, code_of, decode, fresh_walk, success_of
 from levelproof.experts.witness.success import Success
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.programs import jit_quickly
+from levelproof.levelgen.programs import jit_stored
 from levelproof.levelgen.task.measures import goal_distance
 from levelproof.levelgen.task.rules import TaskParams
 
@@ -42,7 +42,7 @@ class Polishing(NamedTuple):
     number: Int[Array, ""]  # of rounds done
 
 
-@jit_quickly(static_argnames=("config", "rules"))
+@jit_stored(static_argnames=("config", "rules"))
 def shorten(
     levels: Level, level_ids: Int[Array, " level"], success: Success, config: SearchConfig, rules: TaskParams
 ) -> Shortened:
@@ -114,9 +114,12 @@ def replayed(
     code: UInt16[Array, "level lane 256"],
     most: Int[Array, " level"],
     rules: TaskParams,
+    enough: int = 1,
     measured: bool = False,
 ) -> tuple[Int[Array, "level lane"], Float[Array, "level lane"]]:
     """Play each lane's actions from its level's start, for at most this many env steps.
+
+    A level is done once `enough` of its lanes have reached the goal, because the others would take longer.
 
     Returns:
         Env steps until the goal, RECORD_STEPS + 1 if it is not reached; and, in lanes that reach it in env step `most`,
@@ -127,12 +130,17 @@ def replayed(
     def step(now: tuple[Walk, Array]) -> tuple[Walk, Array]:
         walk, near = now
         walk = act(ring, walk, decode(by_step[walk.timestep[0]]), rules)
-        if measured:  # programs compiled by `jit_quickly` may not multiply floats, as distances do
+        if measured:
             near = jnp.where(walk.timestep == last - 1, goal_distance(ring.lanes, walk.state), near)
         return walk, near
 
-    going = lambda now: (now[0].timestep[0] < most.max()) & ~now[0].ended.all()
+    by_level = lambda x: x.reshape(code.shape[:2])
+
+    def going(now: tuple[Walk, Array]) -> Bool[Array, ""]:
+        walk = now[0]
+        few = (by_level(walk.reached) > 0).sum(-1) < enough
+        return (few & (walk.timestep[0] < most) & ~by_level(walk.ended).all(-1)).any()
+
     walk, near = jax.lax.while_loop(going, step, (fresh_walk(ring.lanes), jnp.zeros(len(last))))
     steps = jnp.where((walk.reached > 0) & (walk.reached <= last), walk.reached, RECORD_STEPS + 1)
-    by_level = lambda x: x.reshape(code.shape[:2])
     return by_level(steps), by_level(jnp.where(steps == last, near, 0.0))

@@ -3,6 +3,7 @@
 from functools import cache
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from levelproof.experts.config import ExpertConfig
@@ -10,7 +11,8 @@ from levelproof.experts.labels import Source
 from levelproof.experts.pool.rework import IN_CACHE, rework
 from levelproof.experts.procedure import Procedure
 from levelproof.experts.search.config import SearchConfig
-from levelproof.experts.search.shorten import LANES, Shortened, polish
+from levelproof.experts.search.play import arena, code_of
+from levelproof.experts.search.shorten import LANES, Shortened, polish, replayed
 from levelproof.experts.verdict.judge import repeating
 from levelproof.experts.witness.success import Success
 from levelproof.experts.witness.witness import replay, steps_to_goal
@@ -89,6 +91,24 @@ def test_env_steps_are_limited() -> None:
     assert few.env_steps[0] == 0
     assert few.success.length[0] == 0
     np.testing.assert_array_equal(few.success.length[1:], polished().success.length[1:])
+
+
+def test_replays_end_once_enough_lanes_have_reached_the_goal() -> None:
+    """The first ones are the same as when all lanes play to the end; the others count as failures."""
+    (action, steps), level = shortest(), take(levels(), np.zeros(1, int))
+    waits = np.array([9, 2, 5, 0, 7, 2, 4, 30])
+    late = np.stack([np.concatenate([np.zeros((wait, ACTIONS), np.int8), action[: 256 - wait]]) for wait in waits])
+    code = code_of(Success(late, np.full(len(waits), 256, np.int32)))[None]  # pyright: ignore
+    ring, most = arena(level, len(waits), (1.0,)), jnp.array([steps + waits[0]])
+    run = jax.jit(lambda enough: replayed(ring, code, most, DEFAULT_RULES, enough, measured=True))
+    whole, near = run(len(waits))
+    np.testing.assert_array_equal(whole[0], np.where(waits < 30, steps + waits, 257))
+    np.testing.assert_array_equal(near[0] > 0, waits == 9)  # it takes as long as is allowed
+    for enough, counted in (1, [3]), (2, [1, 3, 5]):
+        early, near = run(enough)
+        np.testing.assert_array_equal(np.flatnonzero(early[0] <= 256), counted)
+        np.testing.assert_array_equal(early[0, counted], whole[0, counted])
+        assert not near.any()
 
 
 def test_run_polishes_witnesses() -> None:
