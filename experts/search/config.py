@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from levelproof.experts.config import MAX_COUNTED
 from levelproof.physics.bounds import require
@@ -20,6 +20,7 @@ class StopLimits(NamedTuple):
     env_steps: Int[Array, ""]
     variations: Int[Array, ""]
     patience: Int[Array, ""]
+    patience_gap: Float[Array, ""]
     per_cell: Int[Array, ""]
     rungs: Int[Array, " rung"]  # env steps after which a level with few cells leaves
 
@@ -29,9 +30,12 @@ class SearchConfig:
     """Settings of a search (hashable: pass as a static argument)."""
 
     env_steps: int = 1_048_576  # per level, over all lanes; rounded up to whole rounds; 0: no search
-    bodies: int = 7  # largest world that gets all env steps; larger ones, of n, get (bodies/n)² of them; 0: no scaling
+    bodies: int = 0  # largest world that gets all env steps; larger ones, of n, get (bodies/n)² of them; 0: no scaling
     variations: int = 262_144  # env steps after the search, on variations of the nearest trajectories; 0: none
     patience: int = 393_216  # env steps without progress before a level leaves (variations: a quarter); 0: no limit
+    patience_gap: float = (
+        0.2  # m, gap of green and blue up to which patience is whole; beyond, it falls as 1/gap; 0: whole
+    )
     first_rung: int = 16_384  # env steps at the first rung; each rung quadruples them
     per_cell: int = 512  # maximum env steps per cell reached for a level to pass a rung; 0: no limit
     # play
@@ -71,7 +75,7 @@ class SearchConfig:
         require(self, ("nearer", "new_action"), 0, 1)
         require(self, ("width",), 0, above=True)
         require(self, ("growth",), 1, above=True)
-        require(self, ("driven_weight",), 0)
+        require(self, ("driven_weight", "patience_gap"), 0)
         if not self.resample or not all(0 < chance <= 1 for chance in self.resample):
             raise ValueError(f"resample is {self.resample}: give probabilities above 0 and at most 1")
         if self.lanes % len(self.resample):
@@ -102,11 +106,23 @@ class SearchConfig:
         """Stopping limits; rungs beyond `env_steps` have no effect."""
         first = -(-self.first_rung // self.steps_per_round) * self.steps_per_round
         rungs = np.array([min(first * 4**i, MAX_COUNTED) for i in range(MAX_RUNGS)], np.int32)
-        return StopLimits(*map(np.int32, (self.env_steps, self.variations, self.patience, self.per_cell)), rungs)  # pyright: ignore
+        env_steps, variations, patience, per_cell = map(
+            np.int32, (self.env_steps, self.variations, self.patience, self.per_cell)
+        )
+        return StopLimits(env_steps, variations, patience, np.float32(self.patience_gap), per_cell, rungs)  # pyright: ignore
 
     @property
     def endless(self) -> "SearchConfig":
         """This configuration without limits and rework: equal for all configurations that share compiled programs."""
         return replace(
-            self, env_steps=0, bodies=0, variations=0, patience=0, first_rung=1, per_cell=0, polish=0, robustness=0
+            self,
+            env_steps=0,
+            bodies=0,
+            variations=0,
+            patience=0,
+            patience_gap=0,
+            first_rung=1,
+            per_cell=0,
+            polish=0,
+            robustness=0,
         )

@@ -136,12 +136,19 @@ def under_way(search: Search, ends: StopLimits) -> Bool[Array, " level"]:
     at_rung = (search.env_steps[:, None] == ends.rungs).any(-1)
     least = -(-search.env_steps // jnp.maximum(ends.per_cell, 1))  # rounded up, without overflow of 32 bits
     few = at_rung & (search.archive.cells < least) & (ends.per_cell > 0)
-    return going & ~few & patient(search.env_steps - search.closed, ends.patience)
+    return going & ~few & patient(search.env_steps - search.closed, search.gap, ends.patience, ends)
 
 
-def patient(waited: Int[Array, " level"], patience: Int[Array, ""]) -> Bool[Array, " level"]:
-    """Return whether levels continue after `waited` env steps without progress; always if `patience` is 0."""
-    return (waited < patience) | (patience == 0)
+def patient(
+    waited: Int[Array, " level"], gap: Float[Array, " level"], patience: Int[Array, ""], ends: StopLimits
+) -> Bool[Array, " level"]:
+    """Return whether levels continue after `waited` env steps without progress; always if `patience` is 0.
+
+    A level leaves sooner the wider its smallest gap so far, because then it is less likely to be solved
+    (docs/tried/patience.md).
+    """
+    share = jnp.where(ends.patience_gap > 0, jnp.minimum(ends.patience_gap / gap, 1.0), 1.0)  # 1 where the gap is 0
+    return (waited < patience * share) | (patience == 0)
 
 
 def draw(level_id: Int[Array, ""], env_steps: Int[Array, ""], config: SearchConfig) -> RoundDraws:

@@ -150,7 +150,7 @@ def under_way(varying: Varying, ends: StopLimits) -> Bool[Array, " level"]:
     """Return for which levels variations continue: no success, env steps left, and lately nearer to the goal."""
     going = (varying.length == 0) & (varying.env_steps < ends.variations)
     less = -(-ends.patience // LESS_PATIENT)  # rounded up, because 0 means no limit
-    return going & patient(varying.env_steps - varying.closed, less)
+    return going & patient(varying.env_steps - varying.closed, varying.gap, less, ends)
 
 
 def together(one: Array, other: Array) -> Array:

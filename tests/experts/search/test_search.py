@@ -27,7 +27,7 @@ from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 from tests.experts.search.worlds import broken, switchback, tower, valley
 from tests.experts.search.worlds import side_by_side as together
 
-CONFIG = SearchConfig(env_steps=262_144, variations=65_536, bodies=9, lanes=32, entries=128)
+CONFIG = SearchConfig(env_steps=262_144, variations=65_536, patience_gap=0, lanes=32, entries=128)
 ROUND = CONFIG.lanes * CONFIG.segments * CONFIG.segment  # env steps
 SWITCHBACK, VALLEY, BROKEN = range(3)
 KINDS = np.array([SWITCHBACK, VALLEY, BROKEN, SWITCHBACK, VALLEY, SWITCHBACK, VALLEY, SWITCHBACK, VALLEY])
@@ -185,6 +185,7 @@ def test_stopping_limits_need_no_recompilation() -> None:
     explore(begun(), CONFIG, DEFAULT_RULES)
     before = programs()
     given = {"env_steps": 5000, "variations": 7000, "patience": 300, "per_cell": 9, "first_rung": 2048, "bodies": 30}
+    given |= {"patience_gap": 0.3}
     for name, number in given.items():
         assert number != getattr(CONFIG, name)
         explore(begun(), replace(CONFIG, **{name: number}), DEFAULT_RULES)
@@ -197,7 +198,7 @@ def test_rounds_between_syncs_change_no_result() -> None:
 
 
 def test_level_without_progress_leaves() -> None:
-    config = replace(CONFIG, patience=65_536, per_cell=0)
+    config = replace(CONFIG, patience=65_536, patience_gap=0, per_cell=0)
     now = begun()
     at = lambda waited: replace(
         now, closed=jnp.full_like(now.closed, 8192), env_steps=jnp.full_like(now.env_steps, 8192 + waited)
@@ -205,6 +206,21 @@ def test_level_without_progress_leaves() -> None:
     assert under_way(at(65_536 - ROUND), config.ends).all()
     assert not under_way(at(65_536), config.ends).any()
     assert under_way(at(65_536), replace(config, patience=0).ends).all()
+
+
+def test_patience_falls_with_the_gap() -> None:
+    """Up to `patience_gap` it is whole; at four times that gap it is a quarter."""
+    config = replace(CONFIG, patience=65_536, patience_gap=0.5, per_cell=0)
+    now = begun()
+    gaps = jnp.array(np.resize(np.array([0.0, 0.5, 2.0], np.float32), len(now.gap)))
+    at = lambda waited: replace(now, gap=gaps, env_steps=jnp.full_like(now.env_steps, waited))
+    goes_on = lambda waited, config=config: np.asarray(under_way(at(waited), config.ends))
+    assert goes_on(16_384 - 1).all()
+    np.testing.assert_array_equal(goes_on(16_384), gaps <= 0.5)
+    np.testing.assert_array_equal(goes_on(65_536 - 1), gaps <= 0.5)
+    assert not goes_on(65_536).any()
+    assert goes_on(65_536 - 1, replace(config, patience_gap=0)).all()
+    assert goes_on(65_536, replace(config, patience=0)).all()
 
 
 def test_the_gap_shrinks_on_the_way_to_the_goal() -> None:
@@ -326,7 +342,7 @@ def test_shorten_removes_detours() -> None:
      {"resample": (0.5, 2.0)}, {"resample": ()}, {"entries": 16_385}, {"env_steps": 2**31}, {"driven_weight": -1.0},
      {"first_rung": 0}, {"per_cell": -1}, {"bodies": -1}, {"trials": 2000}, {"robustness": 2000}, {"width": 1e-46},
      {"growth": 1.00000001}, {"lanes": 2**28}, {"patience": -1}, {"variations": 2**31},
-     {"polish": -1}, {"polish": 2**31}, {"robustness": -1}],
+     {"polish": -1}, {"polish": 2**31}, {"robustness": -1}, {"patience_gap": -0.1}],
 )  # fmt: skip
 def test_search_config_rejects_invalid_settings(wrong: dict) -> None:
     with pytest.raises(ValueError, match=f"^{next(iter(wrong))} is"):

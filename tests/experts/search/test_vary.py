@@ -33,7 +33,7 @@ from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.experts.search.worlds import broken, cannon
 from tests.experts.search.worlds import side_by_side as together
 
-CONFIG = SearchConfig(env_steps=2048, variations=131_072, patience=0, bodies=0, lanes=32, entries=128)
+CONFIG = SearchConfig(env_steps=2048, variations=131_072, patience=0, lanes=32, entries=128)
 WIDTH = side_by_side(CONFIG)
 BROKEN = np.arange(WIDTH) % 4 == 3
 IDS = np.arange(40, 40 + WIDTH, dtype=np.int32)
@@ -155,12 +155,17 @@ def test_env_steps_are_limited() -> None:
     assert (end.env_steps[BROKEN] < CONFIG.variations + call).all()
     assert (end.env_steps[~BROKEN] < CONFIG.variations).all()
     assert (end.closed <= end.env_steps).all()
-    impatient = replace(CONFIG, patience=16_384)
+    impatient = replace(CONFIG, patience=16_384, patience_gap=0)
     now = replace(begun(), closed=jnp.full(WIDTH, 1024), env_steps=jnp.full(WIDTH, 1024 + 16_384))
     assert not under_way(now, impatient.ends).any()
     assert under_way(now, CONFIG.ends).all()
-    assert not under_way(now, replace(CONFIG, patience=4 * 16_384).ends).any()  # a quarter of what Go-Explore has
-    assert under_way(now, replace(CONFIG, patience=4 * 16_384 + 4).ends).all()
+    assert not under_way(
+        now, replace(CONFIG, patience=4 * 16_384, patience_gap=0).ends
+    ).any()  # a quarter of what Go-Explore has
+    assert under_way(now, replace(CONFIG, patience=4 * 16_384 + 4, patience_gap=0).ends).all()
+    by_gap = replace(CONFIG, patience=4 * 16_384 + 4, patience_gap=0.2).ends
+    now = replace(now, gap=jnp.where(jnp.array(BROKEN), 0.4, 0.2))
+    np.testing.assert_array_equal(under_way(now, by_gap), ~BROKEN)  # half as much for twice the gap
 
 
 def test_random_draws_are_never_reused() -> None:
