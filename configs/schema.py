@@ -64,6 +64,7 @@ RENAMED: Mapping[str, str] = {
     "stop.steady": "stop.robustness",
 }
 REMOVED: Mapping[str, Any] = {"scout.rounds": 0}  # settings of earlier versions: the value that matches this version
+ADDED: Mapping[str, Any] = {"search.patience_gap": 0.0}  # settings of this version: the value that matches earlier ones
 # Values of `distribution` in the hashed settings of jobs whose levels are not sampled
 FROM_FILES, FROM_RECORDS = "files", "import"
 # In the hashed settings of seed files and of splits grown from them: each record repeats its first episode
@@ -223,8 +224,9 @@ def decisive(settings: Mapping[str, Any], renamed: Mapping[str, str] = RENAMED) 
     """Return the settings that decide results, under today's names, whichever version wrote them.
 
     Splits record the `JobConfig.results` of the version that made them. Readers compare splits by this function's
-    result, so that a setting may lose its effect, change its name or be removed without making a split a different
-    one. A removed setting whose value this version cannot reproduce is kept, so that the configurations differ.
+    result, so that a setting may lose its effect, change its name, be removed or be added without making a split a
+    different one. A removed setting whose value this version cannot reproduce is kept, so that the configurations
+    differ.
 
     Args:
         settings: nested mappings, as in JSON.
@@ -234,6 +236,8 @@ def decisive(settings: Mapping[str, Any], renamed: Mapping[str, str] = RENAMED) 
         ValueError: a setting lies below a value.
     """
     now = {renamed.get(name, name): value for name, value in flat(settings).items() if REMOVED.get(name, ...) != value}
+    groups = {name.partition(".")[0] for name in now}  # a split that was imported has few
+    now = {name: value for name, value in ADDED.items() if name.partition(".")[0] in groups} | now
     return nested({name: value for name, value in now.items() if name not in WITHOUT_EFFECT})
 
 

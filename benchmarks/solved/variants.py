@@ -54,7 +54,7 @@ VARIANTS: Mapping[str, Variant] = {
     "default": procedure("default", "a search, experts from a success", "published", "reference", "alone"),
     "label": procedure("label", "a short search, no experts", "default"),
     "masters": procedure("masters", "experts that succeed in 8 of 8 attempts", "default"),
-    "thorough": procedure("thorough", "large worlds are searched for as long as small ones", "default"),
+    "thorough": procedure("thorough", "searches have whole patience at every gap", "default"),
     "no_imitation": without("the default, rehearsed actions are not imitated", expert=ExpertConfig(imitation_weight=0)),
     "width_64": without("the default, hidden layers of 64 units", expert=ExpertConfig(width=64)),
     "alone": Variant("as published, but a level leaves once it is solved", ALONE, ("reference", "original")),

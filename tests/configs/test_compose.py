@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 
 from levelproof.configs.compose import (
     FOLDERS,
+    changed_settings,
     compose_job,
     default_presets,
     distributions,
@@ -18,10 +19,10 @@ from levelproof.configs.compose import (
     presets,
     shortest_command,
 )
-from levelproof.configs.convert import flat, plain
+from levelproof.configs.convert import flat, nested, plain
 from levelproof.configs.errors import ConfigError, warn_of_name
 from levelproof.configs.meanings import every_setting
-from levelproof.configs.schema import RENAMED, WITHOUT_EFFECT, decisive, hash_of
+from levelproof.configs.schema import ADDED, RENAMED, WITHOUT_EFFECT, decisive, hash_of
 from levelproof.experts.config import ExpertConfig
 from levelproof.levelgen.sampling.distribution import Distribution
 from levelproof.levelgen.task.rules import TaskParams
@@ -171,10 +172,20 @@ def test_decisive_renames_settings_of_earlier_versions() -> None:
     old = {"size": "s", "budget": 128_000, "expert": {"slots": 4, "units": 64}, "scout": {"tries": 3}}
     renamed = {"expert.units": "expert.width", "scout.tries": "search.tries", "rooms": "expert.slots"}
     now = decisive(old | {"rooms": 2}, renamed)
-    assert now == {"size": "s", "budget": 128_000, "expert": {"width": 64}, "search": {"tries": 3}}
+    assert now == {"size": "s", "budget": 128_000, "expert": {"width": 64}, "search": {"tries": 3, "patience_gap": 0}}
     assert decisive(now) == now
     with pytest.raises(ValueError, match="below a value"):
         decisive({"a": 1, "a.b": 2})
+
+
+def test_decisive_adds_settings_that_earlier_versions_lacked() -> None:
+    """With the value that gives the earlier results, not with today's default."""
+    results = compose_job(["search.patience_gap=0"]).results
+    without = {name: value for name, value in flat(results).items() if name not in ADDED}
+    assert decisive(nested(without)) == results
+    assert decisive(compose_job([]).results) == compose_job([]).results
+    assert compose_job(changed_settings(decisive(nested(without)))).results == results
+    assert decisive({"size": "s", "sampler_version": 1}) == {"size": "s", "sampler_version": 1}
 
 
 def test_decisive_drops_removed_settings_that_match_this_version() -> None:
