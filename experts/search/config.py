@@ -32,10 +32,8 @@ class SearchConfig:
     env_steps: int = 1_048_576  # per level, over all lanes; rounded up to whole rounds; 0: no search
     bodies: int = 0  # largest world that gets all env steps; larger ones, of n, get (bodies/n)² of them; 0: no scaling
     variations: int = 262_144  # env steps after the search, on variations of the nearest trajectories; 0: none
-    patience: int = 393_216  # env steps without progress before a level leaves (variations: a quarter); 0: no limit
-    patience_gap: float = (
-        0.2  # m, gap of green and blue up to which patience is whole; beyond, it falls as 1/gap; 0: whole
-    )
+    patience: int = 524_288  # env steps without progress before a level leaves (variations: a quarter); 0: no limit
+    patience_gap: float = 0.1  # m, gap of green and blue beyond which patience falls as 1/gap, to a quarter; 0: never
     first_rung: int = 16_384  # env steps at the first rung; each rung quadruples them
     per_cell: int = 512  # maximum env steps per cell reached for a level to pass a rung; 0: no limit
     # play

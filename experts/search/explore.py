@@ -22,6 +22,7 @@ from levelproof.levelgen.level import ACTIONS, Level
 from levelproof.levelgen.programs import jit_stored
 from levelproof.levelgen.task.rules import TaskParams
 
+LEAST_PATIENCE = 0.25  # share of the patience that is left however wide the gap is
 NEARER = 0.98  # the gap must shrink to this share of the smallest so far to count as progress
 
 
@@ -147,7 +148,8 @@ def patient(
     A level leaves sooner the wider its smallest gap so far, because then it is less likely to be solved
     (docs/tried/patience.md).
     """
-    share = jnp.where(ends.patience_gap > 0, jnp.minimum(ends.patience_gap / gap, 1.0), 1.0)  # 1 where the gap is 0
+    falls = ends.patience_gap > 0
+    share = jnp.where(falls, jnp.clip(ends.patience_gap / gap, LEAST_PATIENCE, 1.0), 1.0)  # a gap of 0: 1
     return (waited < patience * share) | (patience == 0)
 
 

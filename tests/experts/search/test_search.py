@@ -209,14 +209,16 @@ def test_level_without_progress_leaves() -> None:
 
 
 def test_patience_falls_with_the_gap() -> None:
-    """Up to `patience_gap` it is whole; at four times that gap it is a quarter."""
+    """Up to `patience_gap` it is whole; at twice that gap it is half, and never less than a quarter."""
     config = replace(CONFIG, patience=65_536, patience_gap=0.5, per_cell=0)
     now = begun()
-    gaps = jnp.array(np.resize(np.array([0.0, 0.5, 2.0], np.float32), len(now.gap)))
+    gaps = jnp.array(np.resize(np.array([0.0, 0.5, 1.0, 9.0], np.float32), len(now.gap)))
     at = lambda waited: replace(now, gap=gaps, env_steps=jnp.full_like(now.env_steps, waited))
     goes_on = lambda waited, config=config: np.asarray(under_way(at(waited), config.ends))
     assert goes_on(16_384 - 1).all()
-    np.testing.assert_array_equal(goes_on(16_384), gaps <= 0.5)
+    np.testing.assert_array_equal(goes_on(16_384), gaps <= 1.0)
+    np.testing.assert_array_equal(goes_on(32_768 - 1), gaps <= 1.0)
+    np.testing.assert_array_equal(goes_on(32_768), gaps <= 0.5)
     np.testing.assert_array_equal(goes_on(65_536 - 1), gaps <= 0.5)
     assert not goes_on(65_536).any()
     assert goes_on(65_536 - 1, replace(config, patience_gap=0)).all()
