@@ -93,7 +93,7 @@ def report_of(results: list[Results], whole: bool) -> Report:
         title="How many levels are solved",
         results=[{"groups": [document(each) for each in results]}],
         tables=[
-            *([larger.larger_samples()] if whole else []),
+            *([larger.larger_samples(), larger.paired()] if whole else []),
             *tables.tables(results),
             *([plot.table(curves)] if curves else []),
         ],

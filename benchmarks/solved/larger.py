@@ -1,42 +1,90 @@
-"""The default procedure on more levels than the other tables have: the committed seeds and the sealed levels."""
+"""The default procedure on more levels than the other tables have: a report, committed seeds and the sealed levels."""
 
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import pyarrow.parquet as pq
 
 from benchmarks.report import Table
 from benchmarks.solved.results import share
+from benchmarks.statistics import mcnemar
 from levelproof.experts.labels import Label
 from levelproof.pipeline.learn import sealed
 
 SEEDS = Path(__file__).parents[2] / "manifests" / "256k"
-HEAD = ("size", "levels", "undecided levels", "solved (95% interval)", "trivial", "proved unsolvable")
+REPORT = Path(__file__).parents[1] / "results" / "report.json"  # made by make_report.py beside it
+NOW, BEFORE = "today's", "until 2026-11-26"
+HEAD = ("size", "budget", "levels", "defaults", "undecided levels", "solved (95% interval)", "trivial",
+        "proved unsolvable", "core-seconds a solved level")  # fmt: skip
+PAIRED = ("size", "budget", "undecided levels", f"only the defaults {BEFORE} solve", "only today's solve", "p")
+
+
+class Sample(NamedTuple):
+    """Levels that a version of the default procedure labelled."""
+
+    size: str
+    budget: str
+    name: str
+    defaults: str
+    counts: Counter[str]  # levels by label
+    seconds: float | None = None  # of cores
 
 
 def larger_samples() -> Table:
-    """Make a row for each committed sample of levels; all were labelled at 256k env steps."""
-    rows = [row_of(size, name, counts) for size, name, counts in samples()]
-    return Table(HEAD, rows, "**The default procedure at 256k env steps on larger samples**")
+    """Make a row for each committed sample of levels."""
+    return Table(HEAD, [row_of(sample) for sample in samples()], "**The default procedure on larger samples**")
 
 
-def samples() -> Iterator[tuple[str, str, Mapping[str, int]]]:
-    """Yield size, name and number of levels of each label."""
-    for folder in sorted(SEEDS.iterdir()):
-        labels = [
-            label for path in sorted(folder.glob("*.parquet")) for label in pq.read_table(path)["label"].to_pylist()
+def paired() -> Table:
+    """Compare the defaults before and today's on the levels of the report."""
+    splits = {(bool(split["settings"]), split["size"]): split for split in _report()["splits"]}
+    rows = []
+    for size in [size for before, size in splits if before]:
+        undecided = [
+            pair
+            for pair in zip(splits[True, size]["labels"], splits[False, size]["labels"], strict=False)
+            if {*pair} <= {"s", "u"}
         ]
-        yield folder.name, f"`manifests/256k/{folder.name}`", Counter(labels)
-    known = json.loads(Path(sealed.__file__).with_name(sealed.KNOWN).read_text())["sizes"]
+        lost, gained = (undecided.count(pair) for pair in (("s", "u"), ("u", "s")))
+        numbers = f"{len(undecided):,}", str(lost), str(gained), f"{mcnemar(lost, gained):.2g}"
+        rows.append([size, splits[True, size]["budget"], *numbers])
+    return Table(PAIRED, rows, "Level by level")
+
+
+def samples() -> Iterator[Sample]:
+    """Yield the report's levels, then the committed seeds, then the sealed levels."""
     meaning = {letter: label for label, letter in sealed.LETTERS.items()}
+    labels = lambda letters: Counter(str(meaning[letter]) for letter in letters)
+    report = _report()
+    for split in sorted(report["splits"], key=lambda split: ("sml".index(split["size"]), not split["settings"])):
+        name = f"{len(split['labels']):,}, from id {report['first_level']:,} on"
+        when = BEFORE if split["settings"] else NOW
+        yield Sample(split["size"], split["budget"], name, when, labels(split["labels"]), split["core_seconds"])
+    for folder in sorted(SEEDS.iterdir()):
+        known = [label for path in sorted(folder.glob("*.parquet")) for label in _labels(path)]
+        yield Sample(folder.name, "256k", f"{len(known):,}, `manifests/256k/{folder.name}`", BEFORE, Counter(known))
+    known = json.loads(Path(sealed.__file__).with_name(sealed.KNOWN).read_text())["sizes"]
     for size, of_size in known.items():
-        yield size, "sealed levels", Counter(meaning[letter] for letter in of_size["labels"])
+        name = f"{len(of_size['labels']):,}, sealed levels"
+        yield Sample(size, "256k", name, BEFORE, labels(of_size["labels"]))
 
 
-def row_of(size: str, name: str, counts: Mapping[str, int]) -> list[str]:
-    solved, unsolved = counts[Label.SOLVED], counts[Label.UNSOLVED]
-    total, undecided = sum(counts.values()), solved + unsolved
+def row_of(sample: Sample) -> list[str]:
+    counts = sample.counts
+    solved, total = counts[Label.SOLVED], sum(counts.values())
+    undecided = solved + counts[Label.UNSOLVED]
     decided = [f"{counts[label] / total:.1%}" for label in (Label.TRIVIAL, Label.UNSOLVABLE)]
-    return [size, f"{total:,}, {name}", f"{undecided:,}", share(solved, undecided), *decided]
+    cost = "-" if sample.seconds is None else f"{sample.seconds / solved:.3g}"
+    shown = sample.size, sample.budget, sample.name, sample.defaults, f"{undecided:,}", share(solved, undecided)
+    return [*shown, *decided, cost]
+
+
+def _labels(path: Path) -> Sequence[str]:
+    return pq.read_table(path, columns=["label"])["label"].to_pylist()
+
+
+def _report() -> dict[str, Any]:
+    return json.loads(REPORT.read_text())
