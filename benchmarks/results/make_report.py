@@ -1,4 +1,4 @@
-"""Write the labels and costs of splits to report.json, for the first tables of docs/results/solved.md.
+"""Write the labels of splits to report.json, for the first tables of docs/results/solved.md.
 
 then="search.bodies=7 search.patience=393216 search.patience_gap=0"  # the defaults until 2026-11-26
 for settings in "$then out=before" out=after; do
@@ -19,7 +19,7 @@ from levelproof.pipeline.learn.sealed import LETTERS
 from levelproof.pipeline.store.manifest import require_manifest
 
 FIRST, LEVELS = 1_100_000, {"s": 2000, "m": 1200, "l": 1120}  # id of the first level; levels that count, by size
-COLUMNS = ["level_id", "label", "budget", "size", "seconds", "device"]
+COLUMNS = ["level_id", "label", "budget", "size", "device"]
 
 
 def described(split: Path) -> dict[str, Any]:
@@ -34,7 +34,6 @@ def described(split: Path) -> dict[str, Any]:
         "budget": rows[0]["budget"],
         "settings": " ".join(settings),
         "device": rows[0]["device"],
-        "core_seconds": round(sum(sum(row["seconds"].values()) for row in rows)),
         "labels": "".join(LETTERS[row["label"]] for row in rows),
     }
 

@@ -17,8 +17,16 @@ from levelproof.pipeline.learn import sealed
 SEEDS = Path(__file__).parents[2] / "manifests" / "256k"
 REPORT = Path(__file__).parents[1] / "results" / "report.json"  # made by make_report.py beside it
 NOW, BEFORE = "today's", "until 2026-11-26"
-HEAD = ("size", "budget", "levels", "defaults", "undecided levels", "solved (95% interval)", "trivial",
-        "proved unsolvable", "core-seconds a solved level")  # fmt: skip
+HEAD = (
+    "size",
+    "budget",
+    "levels",
+    "defaults",
+    "undecided levels",
+    "solved (95% interval)",
+    "trivial",
+    "proved unsolvable",
+)
 PAIRED = ("size", "budget", "undecided levels", f"only the defaults {BEFORE} solve", "only today's solve", "p")
 
 
@@ -30,7 +38,6 @@ class Sample(NamedTuple):
     name: str
     defaults: str
     counts: Counter[str]  # levels by label
-    seconds: float | None = None  # of cores
 
 
 def larger_samples() -> Table:
@@ -42,7 +49,7 @@ def paired() -> Table:
     """Compare the defaults before and today's on the levels of the report."""
     splits = {(bool(split["settings"]), split["size"]): split for split in _report()["splits"]}
     rows = []
-    for size in [size for before, size in splits if before]:
+    for size in sorted((size for before, size in splits if before), key="sml".index):
         undecided = [
             pair
             for pair in zip(splits[True, size]["labels"], splits[False, size]["labels"], strict=False)
@@ -62,7 +69,7 @@ def samples() -> Iterator[Sample]:
     for split in sorted(report["splits"], key=lambda split: ("sml".index(split["size"]), not split["settings"])):
         name = f"{len(split['labels']):,}, from id {report['first_level']:,} on"
         when = BEFORE if split["settings"] else NOW
-        yield Sample(split["size"], split["budget"], name, when, labels(split["labels"]), split["core_seconds"])
+        yield Sample(split["size"], split["budget"], name, when, labels(split["labels"]))
     for folder in sorted(SEEDS.iterdir()):
         known = [label for path in sorted(folder.glob("*.parquet")) for label in _labels(path)]
         yield Sample(folder.name, "256k", f"{len(known):,}, `manifests/256k/{folder.name}`", BEFORE, Counter(known))
@@ -77,9 +84,8 @@ def row_of(sample: Sample) -> list[str]:
     solved, total = counts[Label.SOLVED], sum(counts.values())
     undecided = solved + counts[Label.UNSOLVED]
     decided = [f"{counts[label] / total:.1%}" for label in (Label.TRIVIAL, Label.UNSOLVABLE)]
-    cost = "-" if sample.seconds is None else f"{sample.seconds / solved:.3g}"
     shown = sample.size, sample.budget, sample.name, sample.defaults, f"{undecided:,}", share(solved, undecided)
-    return [*shown, *decided, cost]
+    return [*shown, *decided]
 
 
 def _labels(path: Path) -> Sequence[str]:
