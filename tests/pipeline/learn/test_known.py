@@ -19,7 +19,7 @@ def test_known_sealed_levels_are_what_a_job_makes_of_them(size: str, tmp_path: P
 
     Of l, 5 experts have other successes on an Intel processor than on the AMD that made what is known.
     """
-    then = "search.bodies=7 search.patience_gap=0"  # the defaults when they were labelled
+    then = "search.bodies=7 search.patience=393216 search.patience_gap=0"  # the defaults when they were labelled
     job = f"generate size={size} first_level={SEALED.start} levels=32 budget=256k executor=inline {then}"
     assert here(job.split(), tmp_path).returncode == 0
     table = read_manifest(tmp_path / "data" / "256k" / size).table.sort_by("level_id")
