@@ -21,6 +21,8 @@ BENCHMARKS = {  # name: (module, what it measures)
     "fidelity": ("benchmarks.fidelity", "whether our random levels are the reference's, statistic by statistic"),
     "solved": ("benchmarks.solved.command", "how many levels experts solve, how soon and at what cost"),
     "search": ("benchmarks.search", "how many more levels a longer search would solve"),
+    "late": ("benchmarks.late", "which levels only a long search solves, and how"),
+    "prior": ("benchmarks.prior", "what attempts of a policy before the search would find and save"),
     "training": ("benchmarks.training", "env steps/s of rollout, update, and the program that does both"),
     "networks": ("benchmarks.networks", "multiply-adds of the networks, and env steps/s of training with each"),
     "floor": ("benchmarks.floor", "what each stage of a physics step costs, and the floor of its arithmetic"),
