@@ -48,17 +48,16 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Order the groups of tests, before pytest-xdist hands them out."""
     seed = config.getoption("shuffle")
-    order = by_slow_tests(items) if seed is None else shuffled(items, seed)
+    order = by_weight(items) if seed is None else shuffled(items, seed)
     items.sort(key=lambda item: order[group_of(item.nodeid)])
 
 
-def by_slow_tests(items: list[pytest.Item]) -> dict[str, Any]:
-    """Return a sort key per group: groups with many slow tests come early, so that none is left for a single process
-    at the end; groups that compile without XLA's optimiser come after the others."""
-    slow = Counter(group_of(item.nodeid) for item in items if item.get_closest_marker("slow"))
-    groups = {group_of(item.nodeid) for item in items}
+def by_weight(items: list[pytest.Item]) -> dict[str, Any]:
+    """Return a sort key per group: groups with many tests come early, so that none is left for a single process at the
+    end; groups that compile without XLA's optimiser come after the others."""
+    count = Counter(group_of(item.nodeid) for item in items)
     brief = {group_of(item.nodeid) for item in items if is_brief(item.nodeid)}
-    return {group: (group != FIRST, not group.startswith(BESIDE), group in brief, -slow[group]) for group in groups}
+    return {group: (group != FIRST, not group.startswith(BESIDE), group in brief, -count[group]) for group in count}
 
 
 def shuffled(items: list[pytest.Item], seed: str) -> dict[str, int]:
@@ -116,7 +115,7 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
         if reason.startswith(NOT_REACHED):
             for line in lines_of(nodeid for nodeid, why in reason_of.items() if why == reason):
                 terminalreporter.line(f"    {line}")
-    terminalreporter.line(f"{deselected} deselected (-m '{marks}'); `pytest -m campaign` runs the campaigns")
+    terminalreporter.line(f"{deselected} deselected (-m '{marks}'); CONTRIBUTING.md says how to run them")
 
 
 def lines_of(nodeids: Iterable[str]) -> list[str]:

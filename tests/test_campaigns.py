@@ -52,6 +52,7 @@ def order(output: str) -> list[str]:
     return [file for number, file in enumerate(files) if number == 0 or file != files[number - 1]]
 
 
+@pytest.mark.slow
 def test_shuffle_orders_files_by_seed_and_keeps_their_tests_together(folder: Path) -> None:
     first, again, other = (order(run_pytest(folder, f"--shuffle={seed}")) for seed in ("1f0a", "1f0a", "77c3"))
     assert first == again
@@ -59,6 +60,7 @@ def test_shuffle_orders_files_by_seed_and_keeps_their_tests_together(folder: Pat
     assert sorted(first) == sorted(other) == sorted(map(str, range(FILES)))
 
 
+@pytest.mark.slow
 def test_summary_names_campaigns_that_were_not_reached(folder: Path) -> None:
     for processes in ((), ("-n2", "--no-loadscope-reorder")):
         output = run_pytest(folder, "--shuffle=1f0a", "--within=-1", *processes)

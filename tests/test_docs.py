@@ -51,7 +51,11 @@ def test_readme_has_python() -> None:
     assert PAGES[0].name == "README.md"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+@pytest.mark.parametrize(
+    "page",
+    [PAGES[0], *(pytest.param(page, marks=pytest.mark.slow) for page in PAGES[1:])],
+    ids=lambda page: page.relative_to(ROOT).as_posix(),
+)
 def test_python_of_a_page_runs_from_top_to_bottom(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     exec(compile("\n".join(blocks(page)), str(page), "exec"), {"__name__": "__main__"})

@@ -68,6 +68,7 @@ def test_seeds_grow_to_the_states_of_their_checksums(rows: int) -> None:
     assert batch.goal[np.arange(rows), steps - 1].all()
 
 
+@pytest.mark.slow
 def test_sample_data_is_the_first_levels_of_the_seeds() -> None:
     """The file is a cut of the committed seeds, small enough for the wheel."""
     assert SAMPLE.stat().st_size < 400_000
@@ -77,7 +78,6 @@ def test_sample_data_is_the_first_levels_of_the_seeds() -> None:
     assert data.read([0, 1]).goal.any(1).all()
 
 
-@pytest.mark.slow
 def test_three_levels_keep_their_labels() -> None:
     """Two were solved early and one never reached the goal, so differences in last bits do not change their labels."""
     by_expert = [row for row in ROWS if row["label"] == "solved" and row["steps_to_first_success"] is not None]

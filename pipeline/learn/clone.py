@@ -141,6 +141,7 @@ def train(
         Failure: the weights have diverged.
     """
     last, first, recent, began, aside = config.train.updates, int(state.updates), [], time.monotonic(), 0.0
+    before = metrics.last.get("bc/core_seconds", 0.0)
     with shown(console, "reading levels", last, first) as show:
         feed = Feed(sources, config, lambda count: show(0, f"reading {count} levels"))
         held = {str(source.data.split): validation_batches(source, config) for source in sources}
@@ -159,6 +160,7 @@ def train(
                 paused = time.monotonic()
                 numbers = {COURSE.step: update, "bc/samples_per_second": rate * config.train.batch}
                 numbers |= averages("", recent) | validated(state, held, config)
+                numbers["bc/core_seconds"] = before + time.process_time()
                 require_finite(numbers["bc/loss"], "train.learning_rate")
                 recent = []
                 save(state)

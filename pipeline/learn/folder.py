@@ -3,7 +3,7 @@
 import hashlib
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -30,12 +30,17 @@ def made(out: Path) -> Path:
     return out
 
 
-def require_same_run(out: Path, note: dict[str, Any]) -> None:
-    """Raise UserError if `out` holds a run of other settings or data, or a policy of unknown origin."""
+def require_same_run(
+    out: Path, note: dict[str, Any], compared: Callable[[dict[str, Any]], Any] = lambda note: note
+) -> None:
+    """Raise UserError if `out` holds a run of other settings or data, or a policy of unknown origin.
+
+    `compared` returns what of a note must be equal.
+    """
     if (before := note_in(out)) is None:
         if (out / CONFIG).exists():
             raise UserError(f"{out} has a policy already: choose another folder with -o.")
-    elif before != note:
+    elif compared(before) != compared(note):
         raise UserError(f"{out} has a run with other settings or levels: repeat its command, or choose another -o.")
 
 

@@ -76,13 +76,15 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
     note = note_of(config, source, cores)
     params = None if start is None else start.params
     with explaining_writes(out), only_clone(made(out)) as require_ours:
-        require_same_run(out, note)
-        write_note(out, note)
+        require_same_run(out, note, endless)
         table = table_of(source.levels, recipe.rules)
         programs = programs_of(recipe, table, params, cores)
         fresh = programs.begin(table, params)
         learner = jax.tree.map(lambda x, like: jax.device_put(x, like.sharding), continued(out, fresh), fresh)
         steps = int(learner.updates) * config.ppo.steps_per_update
+        if learner.updates > config.ppo.updates:
+            raise UserError(f"{out} has {steps:,} env steps of training already: set a larger ppo.env_steps.")
+        write_note(out, note)
         metrics, done = Metrics(out, COURSE, config.log, note, steps, tell), False
 
         def save(learner: Learner) -> None:
@@ -153,6 +155,13 @@ def note_of(config: TrainConfig, source: TrainingLevels, cores: int) -> dict[str
         "start": weights_digest(config.start),
         "cores": cores,
     }
+
+
+def endless(note: dict[str, Any]) -> dict[str, Any]:
+    """Return a run's note without the env steps after which it ends, which a resumed run may change."""
+    settings = note["settings"]
+    ppo = {name: value for name, value in settings["ppo"].items() if name != "env_steps"}
+    return note | {"settings": settings | {"ppo": ppo}}
 
 
 def update_until_done(

@@ -47,7 +47,6 @@ def test_report_has_medians_and_names_missed_targets() -> None:
 
 
 @pytest.mark.campaign
-@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_cold_job_compiles_and_warm_job_loads() -> None:
     cold, warm = run(parser("cold").parse_args(["cold", "--runs", "1", "--larger", "", "--", *SMALL])).results

@@ -29,7 +29,6 @@ def test_memory_of_counts_a_process_and_its_descendants() -> None:
 
 
 @pytest.mark.campaign
-@pytest.mark.slow
 def test_night_generates_seals_and_verifies(tmp_path: Path) -> None:
     arguments = ["night", "--levels", "256", "--budget", "4k", "--every", "0.5", "--out", str(tmp_path / "data")]
     report = run(parser("night").parse_args(arguments))

@@ -55,6 +55,7 @@ def test_scheduler_memory_does_not_grow_with_levels() -> None:
     assert rehearsed(CALM, SECONDS)["first"] == "workers"
 
 
+@pytest.mark.slow
 def test_default_unit_size_keeps_ten_thousand_workers_busy() -> None:
     """With units of 32 levels of 0.25 s, workers would wait for the driver a fifth of their time."""
     scene = replace(CALM, levels=16_000_000, workers=10_000, a_machine=64)

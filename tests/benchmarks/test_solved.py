@@ -366,6 +366,7 @@ def test_judged_is_unsolved_without_a_successful_attempt() -> None:
     assert original.judged(shown({2: [(0, True)]}, None), config, False).label is Label.SOLVED
 
 
+@pytest.mark.slow
 def test_main_explains_a_missing_reference(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -75,6 +75,7 @@ def in_process(cache: Path) -> tuple[int, int, str]:
     return int(traced), int(loaded), result
 
 
+@pytest.mark.slow
 def test_another_process_neither_traces_nor_compiles(tmp_path: Path) -> None:
     traced, loaded, result = in_process(tmp_path / "cache")
     assert traced
@@ -168,6 +169,7 @@ def test_loaded_program_takes_what_is_donated(folder: Path) -> None:
     assert x.is_deleted()
 
 
+@pytest.mark.slow
 def test_stored_program_can_be_part_of_another() -> None:
     levels = sample_levels(np.arange(16), "s")
     alone = examine(levels, DEFAULT_RULES, 8)

@@ -64,6 +64,7 @@ def lanes_of(given: Inputs, lanes: np.ndarray) -> Inputs:
     return jax.tree.map(lambda x: np.asarray(x)[..., lanes], given)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rules", RULES)
 @pytest.mark.parametrize("seed", [1, 2])
 def test_machine_code_of_a_lane_ignores_its_neighbours(rules: str, seed: int) -> None:

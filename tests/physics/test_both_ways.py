@@ -23,6 +23,7 @@ def here(name: str):
     return jax.jit(lambda given: step(*given))(worlds(name))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "names",
     [

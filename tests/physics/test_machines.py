@@ -44,6 +44,7 @@ def digest_after(size: str, advance: Callable[[Inputs], State]) -> str:
     return total.hexdigest()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif("baseline" not in PROCESSORS, reason="the baseline processor is only known for x86")
 @pytest.mark.parametrize("size", ["s", pytest.param("l", marks=pytest.mark.campaign)])
 def test_step_for_an_old_processor_gives_the_same_bits(size: str) -> None:

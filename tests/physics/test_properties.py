@@ -183,6 +183,7 @@ class TestMirror:
 class TestPrecision:
     """One step in single precision against the same source in double precision."""
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("size", ["s", *(pytest.param(size, marks=pytest.mark.campaign) for size in "ml")])
     def test_single_precision_step_is_close_to_double(self, size: str) -> None:
         world = golden(size)

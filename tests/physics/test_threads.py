@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 from tests.golden.load import HERE
 
 # No kernel exists yet, neither in the process nor on disk. Compiling takes long enough for all threads to ask for the
@@ -34,6 +36,7 @@ assert len(set(results.values())) == 1
 """
 
 
+@pytest.mark.slow
 def test_first_steps_of_six_threads_succeed() -> None:
     environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
     command = [sys.executable, "-c", PROGRAM]

@@ -6,6 +6,8 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
 from levelproof.pipeline.claims import claimed, try_claim
 from tests.pace import patience
 from tests.pipeline.command import ROOT
@@ -39,6 +41,7 @@ with claimed(pathlib.Path(sys.argv[1])):
 """
 
 
+@pytest.mark.slow
 def test_two_processes_compile_a_program_once(tmp_path: Path) -> None:
     script = tmp_path / "compile.py"
     script.write_text(COMPILE)

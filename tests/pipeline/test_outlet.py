@@ -43,6 +43,7 @@ def levelproof(*arguments: str, **streams: Any) -> subprocess.CompletedProcess[s
     )
 
 
+@pytest.mark.slow
 def test_verify_keeps_its_exit_code_when_its_reader_leaves(split: Path, unread: int) -> None:
     done = levelproof("verify", str(split), stdout=unread)
     assert done.returncode == 1
@@ -68,6 +69,7 @@ def test_full_disk_below_stdout_is_an_error(split: Path) -> None:
     assert done.stderr.startswith("Error: OSError")
 
 
+@pytest.mark.slow
 def test_watch_ends_when_its_reader_leaves(split: Path, unread: int) -> None:
     """It ends although the run that it watches continues."""
     workers = {"a machine": {"count": 2, "silent": 1.5}}

@@ -154,6 +154,7 @@ def test_regenerate_keeps_settings_with_old_names(tmp_path: Path) -> None:
     assert compose_job([*kept, "budget=128k"]).hash == made_job("data", *words).hash
 
 
+@pytest.mark.slow
 def test_old_seeds_open_and_grow(new: Path, seed: Path, tmp_path: Path) -> None:
     assert OLD in pq.read_schema(seed).names
     ours, theirs = levelproof.open(new, columns=[NEW]), levelproof.open(seed, columns=[NEW])

@@ -42,6 +42,7 @@ def python(program: str, folder: Path, **environment: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_batched_factorisations_do_not_deadlock(tmp_path: Path) -> None:
     python(FACTORISE, tmp_path)
 

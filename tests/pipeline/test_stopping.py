@@ -19,6 +19,7 @@ def send(number: signal.Signals) -> None:
     os.kill(os.getpid(), number)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beside", ["1", "0"])
 def test_sigterm_ends_a_job_whose_seal_hangs(tmp_path: Path, beside: str) -> None:
     process = start([str(tmp_path), "1", beside], tmp_path, module="tests.pipeline.slow_seal")

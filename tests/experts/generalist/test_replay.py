@@ -108,6 +108,7 @@ def bred() -> tuple[Population, Population]:
     return now, EVOLVE.breed(now, np.random.default_rng(0))
 
 
+@pytest.mark.slow
 def test_children_take_the_slots_of_low_scores_and_wait() -> None:
     before, after = bred()
     new = np.asarray(waiting(after.buffer))
@@ -138,6 +139,7 @@ def test_a_child_is_scored_by_its_own_episodes_only() -> None:
     assert name + 32 not in scores(played), "an earlier or later child of the same slot is unknown"
 
 
+@pytest.mark.slow
 def test_lanes_play_children_and_random_levels_of_one_table() -> None:
     _, after = bred()
     slots = np.flatnonzero(waiting(after.buffer))[:2]

@@ -31,6 +31,8 @@ from levelproof.levelgen.task.observe.flat import state_features
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskState
 from tests.quick import jit_once
 
+pytestmark = pytest.mark.slow
+
 COUNT = 16
 SEARCH = TeachersConfig(witness=2, random=16, learner=0)
 AT = np.arange(COUNT, dtype=np.int32) * 2  # env steps after which teachers are asked

@@ -21,6 +21,7 @@ def test_builtin_policies_are_small_and_say_how_they_were_made() -> None:
         assert "levelproof clone" in (BUILTIN_AT / name / "README.md").read_text()
 
 
+@pytest.mark.slow
 def test_builtin_policy_solves_levels_that_it_has_not_seen() -> None:
     """Far more than doing nothing does, on levels behind those that it was cloned from."""
     policy, ids = load_policy(f"{BUILTIN}s"), np.arange(500_000, 500_128, dtype=np.int32)

@@ -17,6 +17,7 @@ def test_initial_kernels_are_orthogonal(shape: tuple[int, int]) -> None:
     assert np.abs(kernels[0] - kernels[1]).max() > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tokens", [1, 2, 7, 12])
 def test_maximum_sends_its_gradient_to_one_of_the_largest_tokens(tokens: int) -> None:
     """That of `jnp.max` divides by their number, which XLA may find to be 0."""

@@ -110,6 +110,7 @@ def test_logits_differ_between_levels_and_states_of_a_lane_do_not_touch_others()
     np.testing.assert_allclose(among[:, [3] * COUNT], alone, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(PolicyKind))
 def test_saved_policy_gives_the_same_bits(kind: PolicyKind, tmp_path: Path) -> None:
     levels, policy = levelproof.sample_levels(np.arange(COUNT), "s"), policy_of(kind)

@@ -40,6 +40,7 @@ def result(levels: Level, reports) -> UnitResult:
     return label(levels, IDS, BUDGET, untouched(WHOLE), report=lambda *now: reports.append(now))
 
 
+@pytest.mark.slow
 def test_run_returns_consistent_verdicts(result: UnitResult) -> None:
     assert [int(i) for i in result.level_ids] == IDS.tolist()
     labels = {v.label for v in result.verdicts}

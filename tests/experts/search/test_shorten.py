@@ -5,6 +5,7 @@ from functools import cache
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from levelproof.experts.config import ExpertConfig
 from levelproof.experts.labels import Source
@@ -67,6 +68,7 @@ def polished() -> Shortened:
     return jax.device_get(polish(levels(), IDS, given(), ENV_STEPS, DEFAULT_RULES))
 
 
+@pytest.mark.slow
 def test_polish_finds_the_shortest_success() -> None:
     success, length = polished().success
     np.testing.assert_array_equal(length, shortest()[1])
@@ -93,6 +95,7 @@ def test_env_steps_are_limited() -> None:
     np.testing.assert_array_equal(few.success.length[1:], polished().success.length[1:])
 
 
+@pytest.mark.slow
 def test_replays_end_once_enough_lanes_have_reached_the_goal() -> None:
     """The first ones are the same as when all lanes play to the end; the others count as failures."""
     (action, steps), level = shortest(), take(levels(), np.zeros(1, int))

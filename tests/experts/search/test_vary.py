@@ -94,6 +94,7 @@ def test_search_runs_variations_after_go_explore() -> None:
     assert job.env_steps == result.env_steps.sum() + result.varied.sum()
 
 
+@pytest.mark.slow
 def test_nearest_trajectories_replay_to_their_gaps() -> None:
     """Each trajectory has its smallest gap at its step; all are distinct, the nearest first."""
     now = begun()

@@ -155,6 +155,7 @@ def test_polish_continues_training_after_a_level_is_solved(levels: Level, solved
         same(polished[i].evaluations[0], solved[i].evaluations[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stopping", [WHOLE, SOLVED, HALVED], ids=["budget", "solved", "halving"])
 def test_continued_expert_equals_one_trained_without_a_break(levels: Level, stopping: StopConfig) -> None:
     """A level that left at a rung is over, and uses none of the larger budget."""
@@ -171,6 +172,7 @@ def test_continued_expert_equals_one_trained_without_a_break(levels: Level, stop
         same(level, through[i])
 
 
+@pytest.mark.slow
 def test_expert_rehearses_an_earlier_success_from_the_first_update(levels: Level, whole: list[TrainedLevel]) -> None:
     """The first episode repeats it to the goal; rehearsing lanes do not count as the expert's own."""
     findings = nothing_found(len(IDS))._replace(success=random_successes(levels, IDS))

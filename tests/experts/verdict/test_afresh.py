@@ -41,6 +41,7 @@ def result(run: TrainingRun) -> UnitResult:
     return run.finish()
 
 
+@pytest.mark.slow
 def test_success_rate_differs_from_that_of_the_last_evaluation(run: TrainingRun, result: UnitResult) -> None:
     """If all attempts of the last evaluation succeeded, others may still fail."""
     assert run.submission

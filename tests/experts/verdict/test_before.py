@@ -18,8 +18,6 @@ from levelproof.levelgen.task.rules import DEFAULT_RULES
 
 COUNT = 150  # three blocks, the last one not full
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def levels() -> Level:

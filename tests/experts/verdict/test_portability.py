@@ -56,6 +56,7 @@ def starts(levels: Level) -> Level:
     return jax.device_get(replace(lanes, state=jax.jit(moved, static_argnums=2)(lanes, IDS[at], REPLAYS)))
 
 
+@pytest.mark.slow
 def test_portability_is_the_share_of_replays_that_reach_the_goal(
     starts: Level, witnesses: list[Witness], shares: np.ndarray
 ) -> None:

@@ -277,6 +277,7 @@ def paths() -> list[tuple[str, ...]]:
     return [path for path in below(document(), ()) if path]
 
 
+@pytest.mark.slow
 @given(st.lists(st.tuples(st.integers(0, 10_000), st.just("set") | st.just("drop"), JUNK), min_size=1, max_size=3))
 @settings(max_examples=150, deadline=None)
 def test_reader_reads_or_refuses_arbitrary_values_anywhere(changes) -> None:

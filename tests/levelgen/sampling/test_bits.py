@@ -46,11 +46,13 @@ def test_levels_have_their_golden_bits_on_an_emulated_arm_processor(name: str, c
     assert digest(level) == GOLDEN[name][0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("triple", arm.TARGETS)
 def test_arm_code_of_the_sampler_fuses_nothing(triple: str) -> None:
     arm.assert_portable(kernel_of(SIZES["s"], Distribution()), triple)
 
 
+@pytest.mark.slow
 def test_level_depends_on_its_id_alone() -> None:
     """Bit for bit, whatever other levels are sampled, in any order, number and position, inside jax.jit or not."""
     ids = np.array([5, 3, 5, CHUNK + 2, 0])

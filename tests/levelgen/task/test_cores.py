@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 PROGRAM = """
 import jax, numpy as np
 from jax.sharding import AxisType, PartitionSpec
@@ -32,6 +34,7 @@ print("equal")
 """
 
 
+@pytest.mark.slow
 def test_two_cores_give_the_same_bits_as_one() -> None:
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
     root = Path(__file__).parents[3]

@@ -145,6 +145,7 @@ def test_resets_draw_from_all_levels(levels: Level, made) -> None:
     assert drawn.any(0).all()
 
 
+@pytest.mark.slow
 def test_reusing_one_key_still_meets_every_level(levels: Level) -> None:
     """For code that never splits its keys: each goes to reset, to the sampling of actions and to every step."""
     eleven = jax.tree.map(lambda x: x[..., :11], levels)  # as many as there are discrete actions
@@ -303,6 +304,7 @@ def test_environment_refuses_64_bit_mode(levels: Level) -> None:
                 what()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "size",
     [
@@ -320,6 +322,7 @@ def test_environment_works_for_sizes_without_some_kinds(size: Size) -> None:
     assert np.isfinite(state.now.state.position).all()
 
 
+@pytest.mark.slow
 def test_gradients_do_not_flow_through_the_world(levels: Level) -> None:
     env, params = make(levels, ActionType.CONTINUOUS)
     _, state = env.reset(jax.random.key(0), params)

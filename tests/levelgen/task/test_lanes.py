@@ -25,6 +25,7 @@ def lanes_last(tree):
     return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), tree)
 
 
+@pytest.mark.slow
 def test_lanes_step_as_mapped_environments_do(levels: Level) -> None:
     env, params = make(levels, rules=task.TaskParams(max_timesteps=5), final_observation=True)
     lanes = Lanes(env)

@@ -61,7 +61,6 @@ def as_level(sample: Golden, lanes) -> Level:
     return lanes_of(sample.level, lanes)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", ["s", "m", "l"])
 class TestAgainstTheReference:
     def test_reward_done_and_goal_equal_the_references(self, size: str) -> None:
@@ -106,7 +105,6 @@ def test_episode_starts_from_the_level() -> None:
     assert (np.asarray(fresh.last_distance) == NO_DISTANCE).all()
 
 
-@pytest.mark.slow
 def test_first_step_has_no_shaping_reward() -> None:
     level = still()
     now, first = episode_step()(level, reset(level), actions(level))
@@ -118,7 +116,6 @@ def test_first_step_has_no_shaping_reward() -> None:
     np.testing.assert_allclose(np.asarray(second.reward)[going], expected[going], atol=1e-6)
 
 
-@pytest.mark.slow
 def test_time_limit_ends_and_restarts_an_episode() -> None:
     level = still()
     start = reset(level)
@@ -135,7 +132,6 @@ def test_time_limit_ends_and_restarts_an_episode() -> None:
     assert (np.asarray(now.timestep)[~np.asarray(outcome.done)] == 255).all()
 
 
-@pytest.mark.slow
 def test_nan_ends_only_its_own_episode() -> None:
     level = still()
     velocity = np.array(level.state.velocity)
@@ -216,7 +212,6 @@ def test_goal_distance_sums_over_pairs_of_centres() -> None:
     np.testing.assert_allclose(goal_distance(level, level.state)[0], expected, rtol=1e-6)
 
 
-@pytest.mark.slow
 def test_touching_red_and_blue_at_once_fails() -> None:
     """Green touching both in the same physics step does not reach the goal."""
     sample = golden("s")

@@ -44,6 +44,7 @@ def made(code: bytes) -> tuple[Callable[[], bytes], list[bytes]]:
     return lambda: calls.append(code) or code, calls
 
 
+@pytest.mark.slow
 def test_second_process_reuses_the_kernel_of_the_first(tmp_path: Path) -> None:
     command = [sys.executable, "-c", PROGRAM, str(tmp_path)]
     first, second = (subprocess.check_output(command, cwd=ROOT, text=True).split() for _ in range(2))

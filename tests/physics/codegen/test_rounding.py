@@ -68,6 +68,7 @@ def test_kernel_leaves_the_mode_of_its_thread_as_it_was() -> None:
     assert np.float32(1e-20) * np.float32(1e-20) != 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("triple", arm.TARGETS)
 def test_arm_code_of_the_step_sets_the_mode_and_fuses_nothing(triple: str) -> None:
     arm.assert_portable(kernel_of(ROOM, Params(), False, buffers_of(Inputs, ROOM)), triple)

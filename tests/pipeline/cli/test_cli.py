@@ -121,13 +121,11 @@ def test_unknown_options_and_urls_are_not_taken_for_folders(tmp_path: Path, argu
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
 def test_inspect_rejects_a_folder_of_splits(made: Path) -> None:
     for above in ("data", "."):
         assert_refused(here(["inspect", above], made), 2, f"{above} is not a split", "name one of them, such as")
 
 
-@pytest.mark.slow
 def test_later_command_keeps_earlier_levels_wanted(split: Path) -> None:
     """Levels that the later command did not request count as missing once they are lost."""
     folder = split.parent.parent.parent
@@ -162,7 +160,6 @@ def test_debug_shows_the_traceback(tmp_path: Path) -> None:
     assert "Traceback" in done.stderr
 
 
-@pytest.mark.slow
 def test_generate_does_nothing_when_all_levels_exist(made: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in made.rglob("*") if path.suffix in (".parquet", ".zarr")}
     done = here(["generate", *TINY], made)
@@ -172,7 +169,6 @@ def test_generate_does_nothing_when_all_levels_exist(made: Path) -> None:
     assert before == {path: path.stat().st_mtime_ns for path in made.rglob("*") if path.suffix in (".parquet", ".zarr")}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("command", [["generate", *TINY], ["inspect", "data/5k/s"], ["status", "data/5k/s"]])
 def test_commands_name_a_damaged_fragment(split: Path, command: list[str]) -> None:
     fragment_paths(split)[1].write_bytes(b"PAR1 and then nothing")
@@ -181,7 +177,6 @@ def test_commands_name_a_damaged_fragment(split: Path, command: list[str]) -> No
 
 
 @pytest.mark.campaign
-@pytest.mark.slow
 def test_generate_remakes_a_deleted_fragment_with_the_same_rows(split: Path) -> None:
     before = lasting(split)
     fragment_paths(split)[1].unlink()
@@ -191,7 +186,6 @@ def test_generate_remakes_a_deleted_fragment_with_the_same_rows(split: Path) -> 
     assert repr(lasting(split)) == repr(before)
 
 
-@pytest.mark.slow
 def test_verify_passes_a_sound_split_and_names_a_damaged_shard(split: Path) -> None:
     done = here(["verify", "data/5k/s", "--json"], split.parents[2])
     assert done.returncode == 0, done.stderr
@@ -208,7 +202,6 @@ def test_verify_passes_a_sound_split_and_names_a_damaged_shard(split: Path) -> N
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.slow
 def test_inspect_shows_the_contents_of_a_split(made: Path) -> None:
     manifest = read_manifest(made / "data/5k/s")
     done = here(["inspect", "data/5k/s"], made)
@@ -222,7 +215,6 @@ def test_inspect_shows_the_contents_of_a_split(made: Path) -> None:
     assert facts["bytes_per_transition"] > 0
 
 
-@pytest.mark.slow
 def test_inspect_takes_a_condition_and_rejects_an_invalid_one(made: Path) -> None:
     facts = json.loads(
         here(["inspect", "data/5k/s", "--json", "--where", "level_id >= 2 -- the last two"], made).stdout
@@ -234,7 +226,6 @@ def test_inspect_takes_a_condition_and_rejects_an_invalid_one(made: Path) -> Non
     assert_refused(done, 2, "Cannot use the condition")
 
 
-@pytest.mark.slow
 def test_status_shows_the_progress_of_a_split(split: Path) -> None:
     facts = json.loads(here(["status", "data/5k/s", "--json"], split.parents[2]).stdout)
     assert (facts["wanted"], facts["done"], facts["running"], facts["quarantined"]) == (4, 4, False, [])
@@ -244,7 +235,6 @@ def test_status_shows_the_progress_of_a_split(split: Path) -> None:
     assert "To resume: levelproof generate levels=4 unit=1 budget=5k\n" in text
 
 
-@pytest.mark.slow
 def test_full_disk_stops_generate_with_one_sentence_and_no_partial_files(tmp_path: Path) -> None:
     """A file size limit replaces the full disk: with both, a write fails partway."""
     limit = 8_000  # bytes; more than the job note, less than the experts, which are written next
@@ -264,7 +254,6 @@ def test_full_disk_stops_generate_with_one_sentence_and_no_partial_files(tmp_pat
     assert len(data) == 1
 
 
-@pytest.mark.slow
 def test_failing_unit_is_given_up_until_other_units_commit_its_levels(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

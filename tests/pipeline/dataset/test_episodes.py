@@ -52,6 +52,7 @@ def test_episodes_are_the_beginnings_of_records(data: Dataset) -> None:
     assert first.mask.all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("observation", ["symbolic_flat", "symbolic_entity", None])
 def test_episodes_of_seeds_are_those_of_their_split(honest: Path, seeds: Path, observation: str | None) -> None:
     ours, theirs = levelproof.open(seeds), levelproof.open(honest)

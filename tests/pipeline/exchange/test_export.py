@@ -25,8 +25,6 @@ from levelproof.pipeline.store.shard import Shard
 from tests.levelgen.opened import open_in_reference
 from tests.pipeline.made import PLAYED, made_job
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def file(split, tmp_path_factory) -> Path:

@@ -6,7 +6,6 @@ import duckdb
 import jax
 import numpy as np
 import pyarrow.parquet as pq
-import pytest
 
 import levelproof
 from levelproof.pipeline.cli.main import main
@@ -16,8 +15,6 @@ from levelproof.pipeline.store.formats import CONFIG_KEY
 from levelproof.pipeline.store.layout import MANIFEST
 from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.made import PLAYED, made_job
-
-pytestmark = pytest.mark.slow
 
 
 def test_export_parquet_keeps_rows_and_worlds(split: Path, tmp_path: Path, capsys, monkeypatch) -> None:

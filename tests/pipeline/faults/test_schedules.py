@@ -24,6 +24,7 @@ def run(first: int, count: int) -> None:
     assert f"{count} schedules, 0 failed" in done.stdout
 
 
+@pytest.mark.slow
 def test_some_fault_schedules_change_nothing() -> None:
     run(FIRST, SOME)
 

@@ -36,6 +36,7 @@ def findings(name: str, folder: Path, seeds: range) -> dict[int, str]:
     return {seed: wrong for seed in seeds if (wrong := defect_of(target, seed))}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TARGETS)
 def test_reader_withstands_a_hundred_inputs(name: str, tmp_path: Path) -> None:
     assert not findings(name, tmp_path, range(FEW))

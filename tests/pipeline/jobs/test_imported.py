@@ -127,6 +127,7 @@ def test_repair_rejects_an_imported_split(folder: Path) -> None:
     assert sorted(path for path in split.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_regenerate_labels_imported_levels_at_another_budget(once: Path, tmp_path: Path) -> None:
     words = [f"manifest={once / 'data/1M/s'}", "budget=5k", "executor=inline"]
     done = here(["regenerate", *words, "where=label != 'solved'"], tmp_path)

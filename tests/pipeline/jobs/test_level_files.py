@@ -30,6 +30,8 @@ from tests.experts.search.worlds import switchback
 from tests.pipeline.command import assert_refused, here, run
 from tests.pipeline.made import lasting
 
+pytestmark = pytest.mark.slow
+
 WORDS = ["procedure=label", "budget=5k", "executor=inline", "unit=4"]
 IDS = TRIVIAL, UNSOLVABLE = 1, 16  # of size s: the first gets a shard, the second does not
 

@@ -62,6 +62,7 @@ def test_scalars_match_the_events() -> None:
     assert first.keys().isdisjoint({"levels/solved_share", "env_steps/per_second"})
 
 
+@pytest.mark.slow
 def test_logged_writes_to_the_working_folder_if_the_split_is_in_a_store(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

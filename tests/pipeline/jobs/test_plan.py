@@ -9,7 +9,6 @@ from tests.pipeline.command import TINY, assert_refused, here
 
 
 @pytest.mark.campaign
-@pytest.mark.slow
 def test_plan_prints_a_forecast_and_leaves_no_file(tmp_path: Path) -> None:
     done = here(["plan", *TINY, "executor=inline", "workers=3", "--json"], tmp_path)
     assert done.returncode == 0, done.stderr

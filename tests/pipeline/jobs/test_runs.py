@@ -25,8 +25,6 @@ ALONE = "workers=1"  # for tests that need no more, because starting each takes 
 SPLIT = Path("data/5k/s")
 LOOPBACK = ("0100007F:", "00000000000000000000000001000000:", "0000000000000000FFFF00000100007F:")  # in /proc/net/tcp
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -24,8 +24,6 @@ from tests.pipeline.made import made_job, made_result
 
 UNIT = WorkUnit((0, 1, 2, 3))
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def job() -> JobConfig:

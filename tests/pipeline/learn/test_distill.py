@@ -51,6 +51,7 @@ def policy(split: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return distilled(tmp_path_factory.mktemp("distilled"), split, *TINY)
 
 
+@pytest.mark.slow
 def test_every_state_has_a_teacher_or_none(policy: Path) -> None:
     curve = metrics(policy)
     assert [line["distill/updates"] for line in curve] == [2, 4, 6]
@@ -62,6 +63,7 @@ def test_every_state_has_a_teacher_or_none(policy: Path) -> None:
     assert sum(line["distill/labelled"] for line in curve) > 0
 
 
+@pytest.mark.slow
 def test_folder_holds_a_policy_with_its_origin(policy: Path, split: Path) -> None:
     loaded = levelproof.load_policy(policy)
     assert loaded.size is None
@@ -70,6 +72,7 @@ def test_folder_holds_a_policy_with_its_origin(policy: Path, split: Path) -> Non
     assert (policy / "curves.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_run_that_was_stopped_continues_bit_for_bit(
     policy: Path, split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -90,6 +93,7 @@ def test_run_that_was_stopped_continues_bit_for_bit(
     assert mine == theirs
 
 
+@pytest.mark.slow
 def test_start_gives_weights_and_network(
     policy: Path, split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -124,12 +128,14 @@ def test_buffer_keeps_the_latest_transitions_and_none_without_a_label() -> None:
     assert with_labels(empty_labels(2, 2), level, labels_of([50, 3, 2]), 3).level.tolist() == [9, 9]
 
 
+@pytest.mark.slow
 def test_run_without_any_label_says_so(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "label_states", lambda asked, *_: labels_of([0] * 16, 6 * asked.level.size.bodies))
     done = here(["distill", str(split), "-o", "policy", *ROUNDS, *TINY, "witnesses=0"], tmp_path)
     assert_refused(done, 2, "No teacher reached the goal from any of 16 states")
 
 
+@pytest.mark.slow
 def test_experts_that_a_split_kept_are_those_of_their_levels(
     split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -206,6 +212,7 @@ def test_bad_input_is_refused_in_one_sentence(words: list[str], sentence: str, s
     assert not (tmp_path / "distilled").exists()
 
 
+@pytest.mark.slow
 def test_folder_of_another_run_is_refused(policy: Path, split: Path, tmp_path: Path) -> None:
     shutil.copytree(policy, tmp_path / "policy")
     done = here(["distill", str(split), "-o", "policy", *ROUNDS, *TEACHERS, *TINY, "seed=1"], tmp_path)

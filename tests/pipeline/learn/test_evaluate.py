@@ -45,6 +45,7 @@ def policy_in(folder: Path, kind: PolicyKind, size: str | None) -> Path:
     return folder / "policy"
 
 
+@pytest.mark.slow
 def test_experts_of_a_split_stand_beside_the_baselines(split: Path, tmp_path: Path) -> None:
     """Their rates are those of the rows; levels that the split lacks are named."""
     rows = read_manifest(split).table.sort_by("level_id").to_pylist()
@@ -183,6 +184,7 @@ def test_each_look_at_the_sealed_levels_is_logged(tmp_path: Path) -> None:
     assert {look["attempts"] for look in looks} == {1}
 
 
+@pytest.mark.slow
 def test_attempts_start_within_witnesses(tmp_path: Path) -> None:
     """What is left of a witness solves its level from there, in as many steps as are left."""
     split = honest_split(tmp_path / "data", 32, 1)

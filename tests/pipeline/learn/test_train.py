@@ -85,6 +85,7 @@ def test_diverged_weights_are_not_kept(easy: tuple[str, ...], tmp_path: Path) ->
     assert not (tmp_path / "agent" / "policy.safetensors").exists()
 
 
+@pytest.mark.slow
 def test_folder_holds_a_policy_that_loads_and_is_evaluated(agent: Path, split: Path) -> None:
     policy = levelproof.load_policy(agent)
     assert policy.origin["env_steps"] == 60 * PER_UPDATE
@@ -98,6 +99,17 @@ def test_run_that_was_stopped_continues_bit_for_bit(
     easy: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     continues_bit_for_bit(easy, tmp_path, monkeypatch)
+
+
+def test_finished_run_continues_to_more_env_steps(easy: tuple[str, ...], tmp_path: Path) -> None:
+    whole = trained(tmp_path / "whole", 3, *easy)
+    longer = trained(tmp_path / "longer", 1, *easy)
+    assert trained(tmp_path / "longer", 3, *easy) == longer
+    for name in (*FILES, "run.json"):
+        assert (longer / name).read_bytes() == (whole / name).read_bytes()
+    shorter = here(["train", "-o", "agent", f"ppo.env_steps={2 * PER_UPDATE}", *LANES, *easy], tmp_path / "longer")
+    assert_refused(shorter, 2, f"agent has {3 * PER_UPDATE:,} env steps of training already")
+    assert json.loads((longer / "run.json").read_text())["settings"]["ppo"]["env_steps"] == 3 * PER_UPDATE
 
 
 @pytest.mark.campaign
@@ -130,6 +142,7 @@ def continues_bit_for_bit(words: tuple[str, ...], tmp_path: Path, monkeypatch: p
     return out
 
 
+@pytest.mark.slow
 def test_start_keeps_its_weights_while_the_critic_fits(
     agent: Path, split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -21,8 +21,6 @@ from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.made import made_split, played_split
 from tests.pipeline.planted import PLANTED, no_hang
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -122,7 +122,6 @@ def test_survey_finds_planted_duplicates(split: Path) -> None:
     assert survey(split, RowQuery("level_id != 3"))["duplicates"]["same"] == NONE
 
 
-@pytest.mark.slow
 def test_inspect_finds_duplicates_in_splits_files_and_folders(split: Path, tmp_path: Path) -> None:
     other, folder = committed(tmp_path / "other", [one("s", 40), one("s", 3)]), tmp_path / "handmade"
     (folder / "deep").mkdir(parents=True)
@@ -143,7 +142,6 @@ def test_inspect_finds_duplicates_in_splits_files_and_folders(split: Path, tmp_p
     assert f"duplicates in {other}: 2 same (such as 3 and 1), 0 near" in shown
 
 
-@pytest.mark.slow
 def test_comparison_refuses_sources_without_levels(split: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="neither a split nor a level file"):
         comparison_of_source(tmp_path)

@@ -136,6 +136,7 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_policy_plays_every_level_as_evaluations_do(
     split: Path, manifest: Manifest, policy: Path, tmp_path: Path
 ) -> None:

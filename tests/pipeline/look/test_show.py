@@ -26,8 +26,6 @@ from levelproof.pipeline.read.levels import find_level
 from levelproof.pipeline.store.manifest import require_manifest
 from tests.pipeline.made import PLAYED, made_job
 
-pytestmark = pytest.mark.slow
-
 
 def level_with(split: Path, label: str) -> int:
     """Id of the last level with that label."""

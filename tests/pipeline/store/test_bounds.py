@@ -147,6 +147,7 @@ def test_write_fragment_writes_unique_strings_without_dictionaries(good: Path) -
     assert {column.path_in_schema.partition(".")[0] for column in without} == {*OWN}
 
 
+@pytest.mark.slow
 def test_read_fragment_refuses_bombs_before_decompressing_them(good: Path, tmp_path: Path) -> None:
     paths = []
     for number, make in enumerate(HOSTILE):

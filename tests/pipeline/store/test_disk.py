@@ -83,7 +83,6 @@ def test_explaining_writes_names_the_file_that_cannot_be_written(tmp_path: Path)
     assert re.match(words, failure(tmp_path, WorkUnit((0,)), refused.value).fatal)
 
 
-@pytest.mark.slow
 def test_save_experts_fails_on_a_full_disk(tiny: Path) -> None:
     with pytest.raises(OSError, match="No space left") as refused:
         save_experts(new_attempt(tiny, unit_name(0, 0)).experts, kept_experts())
@@ -154,7 +153,6 @@ def test_only_to_drive_calls_fsync() -> None:
     assert calls == {"disk.py"}
 
 
-@pytest.mark.slow
 def test_commit_flushes_experts_before_the_fragment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flushed: set[Path] = set()
     fsync = os.fsync

@@ -282,7 +282,6 @@ def test_data_path_refuses_links_inside_of_the_split(tmp_path: Path) -> None:
         data_path(split, experts)
 
 
-@pytest.mark.slow
 def test_commands_refuse_hostile_shards_in_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     split = made_split(tmp_path, [[Label.SOLVED, Label.SOLVED]])
     (name,) = read_manifest(split).shards
@@ -316,7 +315,6 @@ def test_commands_do_not_leave_the_split(tmp_path: Path, capsys: pytest.CaptureF
             assert "which can be neither a shard nor experts of this split" in sentence
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("number", [np.nan, np.inf, -3e38])
 def test_pictures_draw_or_refuse_impossible_states(tmp_path: Path, number: float) -> None:
     split = made_split(tmp_path, [[Label.SOLVED]])

@@ -94,6 +94,7 @@ def held_elsewhere(lock: str, split: Path) -> Iterator[subprocess.Popen[str]]:
         yield holder
 
 
+@pytest.mark.slow
 def test_locks_exclude_on_nfs_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fcntl, "flock", fcntl.lockf)
     monkeypatch.setattr(locks, "PATIENCE", 0.1)

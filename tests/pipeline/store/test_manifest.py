@@ -137,6 +137,7 @@ def test_failed_write_fragment_commits_nothing(tmp_path: Path, job: JobConfig) -
     assert list(tmp_path.rglob("*.*")) == [attempt.begun]
 
 
+@pytest.mark.slow
 def test_read_manifest_detects_damaged_bytes_or_is_unaffected(tmp_path: Path, job: JobConfig) -> None:
     path = commit(tmp_path, job, [0, 1])
     before, whole = read_manifest(tmp_path).table.to_pylist(), path.read_bytes()

@@ -105,6 +105,7 @@ def require_whole(here: Path) -> None:
     assert rest == {"job.json", ".writer.lock"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("every", "how"),
     [(0, ""), (3, "busy"), (4, "lost"), pytest.param(4, "cut", marks=pytest.mark.campaign)],
@@ -144,6 +145,7 @@ def requests_of_a_run(server: Server) -> int:
     return count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("some", [1, pytest.param(8, marks=pytest.mark.campaign)])
 def test_generate_resumes_after_the_store_fails(
     server: Server, here: Path, monkeypatch: pytest.MonkeyPatch, some: int
@@ -196,6 +198,7 @@ STEPS = {  # requests of an attempt: text that a request's line in the log conta
 }
 
 
+@pytest.mark.slow
 @ALSO_MOTO
 @pytest.mark.parametrize(
     "step",
@@ -233,6 +236,7 @@ def test_workers_of_a_replaced_writer_commit_before_or_never(
     require_whole(here)
 
 
+@pytest.mark.slow
 @ALSO_MOTO
 def test_seal_preserves_a_split_in_a_store(server: Server, here: Path, tmp_path: Path) -> None:
     drive(OUT)
@@ -477,6 +481,7 @@ def test_is_leased_compares_no_clocks(
         assert messages == ["Checking whether a run still writes to s3://bucket/data/128k/s, which takes up to 0 s."]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("every", "how"), [(0, ""), (2, "lost")])
 def test_google_store_gets_what_a_folder_gets(
     server: Server, here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int, how: str

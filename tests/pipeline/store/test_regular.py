@@ -26,6 +26,7 @@ def split(tmp_path: Path) -> Path:
     return made_split(tmp_path / "data", [[Label.SOLVED], [Label.UNSOLVED]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lock", [WRITER_LOCK, COMMIT_LOCK])
 @pytest.mark.parametrize("kind", PLANTED)
 def test_seal_refuses_an_irregular_lock(split: Path, profile: Path, lock: str, kind: str) -> None:

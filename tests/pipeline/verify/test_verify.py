@@ -29,7 +29,6 @@ from levelproof.pipeline.verify.verify import examine
 from tests.pipeline.made import honest_split, made_job
 from tests.pipeline.servers import files_of, serving
 
-pytestmark = pytest.mark.slow
 UNIT, UNITS = 8, 6
 
 Row = dict[str, Any]

@@ -1,0 +1,180 @@
+"""Learners at equal cost: reinforcement from scratch, against solved levels, a clone of them, and reinforcement of it.
+
+Everything that a way needs counts as its core-seconds. A stopped run resumes: every command continues what it left,
+training from its checkpoint, and the folder keeps finished evaluations.
+"""
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from benchmarks.cloning import SAMPLED, command, interval_text, kept
+from benchmarks.learners import ATTEMPTS, RATE, SECONDS, STEPS
+from benchmarks.plotting import pyplot
+from benchmarks.report import Report, Table
+from levelproof.pipeline.learn.evaluate import ALL, SOLVED
+from levelproof.pipeline.runtime import own_cores
+from levelproof.pipeline.store.manifest import require_manifest
+
+FIRST = 50_000  # id of the first level to clone from; the measured ones are sealed
+LARGE = ("ppo.environments=2048", "ppo.epochs=2")  # fewer, larger steps than the defaults'
+SCRATCH = (*LARGE, "ppo.learning_rate=3e-4", "ppo.entropy_weight=0.005", "network.width=64")
+TUNING = (*LARGE, "ppo.learning_rate=2e-4", "ppo.entropy_weight=0.002", "ppo.critic_updates=5")
+PLOT = "equal.svg"
+PLAYERS = "random", "sticky random", "its own expert, 256k"
+
+
+class Way(NamedTuple):
+    """How a policy is made."""
+
+    settings: Sequence[str]  # of `levelproof train`, which has the rest of the core-seconds
+    start: str = ""  # policy that training starts from; CLONE: one that is made first
+    colour: str = "#777777"
+
+
+CLONE = "clone"
+WAYS = {
+    "from scratch": Way(SCRATCH, colour="#0072b2"),
+    "from scratch, learnability": Way((*SCRATCH, "levels=learnability"), colour="#56b4e9"),
+    "levels, clone, reinforcement": Way(TUNING, CLONE, "#d55e00"),
+    "levels, clone, learnability": Way((*TUNING, "levels=learnability"), CLONE, "#e69f00"),
+    "from builtin:s": Way(TUNING, "builtin:s", "#009e73"),
+}
+
+
+def register(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=list(WAYS), help="default: all")
+    parser.add_argument("--size", default="s", help="size of the levels (default: s)")
+    parser.add_argument("--core-seconds", type=float, default=3600, help="of each policy (default: 3600)")
+    parser.add_argument("--seeds", type=int, default=1, help="policies of each way (default: 1)")
+    parser.add_argument("--levels", default="8k", help="levels to search for a clone (default: 8k)")
+    parser.add_argument("--updates", type=int, default=1500, help="updates of a clone (default: 1500)")
+    parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of all training")
+    parser.add_argument("--measured", type=int, default=2048, help="sealed levels to measure on (default: 2048)")
+    parser.add_argument("--folder", type=Path, default=Path("equal"), help="where data and policies are kept")
+
+
+def run(args: argparse.Namespace) -> Report:
+    runs = [(way, seed) for seed in range(args.seeds) for way in args.ways]
+    with ThreadPoolExecutor(len(own_cores())) as threads:
+        results = [*threads.map(lambda one: measured(args, *one), runs)]
+    players = results[0]["sealed"]
+    rows = [row for each in results for row in rows_of(each)]
+    rows += [row_of(name, ("", "", ""), players, name) for name in PLAYERS if name in players[ALL]]
+    head = ("policy", "env steps", "core-seconds before training", "in all", "of all", "of solved", "best of 8")
+    return Report(
+        "Learners at equal cost",
+        results,
+        [Table(head, rows, f"Share of sealed levels of {args.size} solved with sampled actions; 95% intervals")],
+        [
+            f"Every policy has {args.core_seconds:,.0f} core-seconds of one core, with compiling, for all that it is "
+            f"made from: the search of {args.levels} levels (`procedure=label`, ids from {FIRST:,} on), the clone "
+            f"({args.updates:,} updates), and reinforcement on random levels for the rest; those of builtin:s do not "
+            "count. *Of all*: "
+            f"{players[ALL]['random']['levels']:,} levels, of which some cannot be solved; *of solved*, and the best "
+            f"of 8 attempts at them: the {players[SOLVED]['random']['levels']:,} that are labelled solved.",
+            *(f"{way}: `levelproof train size={args.size} {' '.join((*WAYS[way].settings, *args.set))}`."
+              for way in args.ways),
+            f"![Share of episodes that reach the goal in training, against core-seconds]({PLOT})",
+            "The plot: each episode is in a random level never played before. Its first point favours short episodes.",
+        ],
+        plots={PLOT: partial(draw, results)},
+    )  # fmt: skip
+
+
+def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
+    """Make one policy, and measure it and its clone on sealed levels."""
+    folder = args.folder / f"{way.replace(', ', '-').replace(' ', '-').replace(':', '-')}-{args.size}-{seed}"
+    evaluate = partial(kept, folder.with_suffix(".json"))
+    start, before, clone = WAYS[way].start, 0.0, None
+    if start == CLONE:
+        start, before = cloned(args, seed)
+        clone = kept(args.folder / f"clone-{args.size}-{seed}.json", start, *measuring(args))
+    curve = trained(args, folder, way, start, seed, args.core_seconds - before)
+    rates = evaluate(folder, *measuring(args))
+    return {"way": way, "seed": seed, "before": before, "curve": curve, "sealed": rates, "clone": clone}
+
+
+def measuring(args: argparse.Namespace) -> Sequence[Any]:
+    """Return the words of `levelproof evaluate` that choose the levels and attempts."""
+    return "--size", args.size, "--attempts", ATTEMPTS, "--levels", args.measured
+
+
+def cloned(args: argparse.Namespace, seed: int) -> tuple[Path, float]:
+    """Search levels, and clone what solves them; return the policy, and the core-seconds of both."""
+    data, policy = args.folder / f"data-{args.size}-{seed}", args.folder / f"clone-{args.size}-{seed}"
+    job = f"levels={args.levels}", f"size={args.size}", f"first_level={FIRST + 10_000_000 * seed}", f"out={data}"
+    command("generate", *job, "procedure=label", "budget=16k", "executor=inline")
+    split = data / "16k" / args.size
+    ledger = require_manifest(split, ["seconds"]).table["seconds"].to_pylist()
+    words = "network.width=64", f"train.updates={args.updates}", f"seed={seed}"
+    command("clone", split, "-o", policy, *words)
+    cloning = lines_of(policy)[-1]["bc/core_seconds"]
+    return policy, sum(sum(row.values()) for row in ledger) + cloning
+
+
+def trained(
+    args: argparse.Namespace, policy: Path, way: str, start: Path | str, seed: int, limit: float
+) -> list[dict[str, float]]:
+    """Train a policy until the next update would exceed `limit` core-seconds; return the lines of its metrics.
+
+    Each command trains up to a number of env steps that the rate so far suggests.
+    """
+    words = [f"size={args.size}", f"seed={seed}", "cores=1", "interval=5", *WAYS[way].settings, *args.set]
+    if start:
+        words.append(f"start={start}")
+    curve, steps = lines_of(policy) if policy.exists() else [], 1
+    while True:
+        steps = max(steps, *(line[STEPS] for line in curve[-1:]), 1)
+        command("train", *words, f"ppo.env_steps={int(steps)}", "-o", policy)
+        curve = lines_of(policy)
+        first, last = curve[0], curve[-1]
+        update = last[STEPS] / last["train/updates"]
+        # Of a single update, most of the seconds are compiling
+        rate = (last[STEPS] - first[STEPS]) / (last[SECONDS] - first[SECONDS]) if len(curve) > 1 else 0.0
+        left = limit - last[SECONDS]
+        if len(curve) == 1:
+            steps = last[STEPS] + update
+        elif left * rate < update:
+            return curve
+        else:
+            steps = last[STEPS] + left * rate // update * update
+
+
+def lines_of(policy: Path) -> list[dict[str, float]]:
+    """Return the lines of a run's metrics; none if it has not begun."""
+    file = policy / "metrics.jsonl"
+    return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
+
+
+def rows_of(each: Mapping[str, Any]) -> list[list[str]]:
+    """Return the rows of a policy: of its clone, if it has one, and of itself."""
+    last, rows = each["curve"][-1], []
+    if each["clone"]:
+        rows.append(row_of(f"{each['way'].rpartition(', ')[0]}", ("0", "", f"{each['before']:,.0f}"), each["clone"]))
+    cost = f"{last[STEPS]:,}", f"{each['before']:,.0f}", f"{each['before'] + last[SECONDS]:,.0f}"
+    return [*rows, row_of(each["way"], cost, each["sealed"])]
+
+
+def row_of(name: str, cost: Sequence[str], rates: Mapping[str, Any], player: str = SAMPLED) -> list[str]:
+    ways = ((ALL, "once"), (SOLVED, "once"), (SOLVED, "best"))
+    return [name, *cost, *(interval_text(rates[levels][player][key]) for levels, key in ways)]
+
+
+def draw(results: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Plot the solve rate of training against all core-seconds, those before training included."""
+    plt = pyplot()
+    figure, axes = plt.subplots(figsize=(6, 3.5), layout="constrained")
+    for each in results:
+        points = [(each["before"] + line[SECONDS], 100 * line[RATE]) for line in each["curve"] if line.get(RATE)]
+        label = each["way"] if each["seed"] == 0 else None
+        axes.plot(*zip(*points, strict=True), color=WAYS[each["way"]].colour, label=label, linewidth=1)
+    axes.set(xlim=(0, None), xlabel="core-seconds", ylabel="episodes that reach the goal, %")
+    axes.legend(frameon=False, loc="lower right")
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, metadata={"Date": None})
+    plt.close(figure)

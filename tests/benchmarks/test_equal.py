@@ -1,0 +1,28 @@
+"""The benchmark of learners at equal cost, on policies that train for seconds."""
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks.__main__ import parser
+from benchmarks.equal import SECONDS, run
+
+pytestmark = pytest.mark.campaign
+TINY = ("ppo.environments=64", "ppo.horizon=32", "ppo.minibatches=4")
+
+
+def test_ways_end_at_the_same_core_seconds(tmp_path: Path) -> None:
+    words = ["equal", "--ways", "from scratch", "levels, clone, reinforcement", "--core-seconds", "200"]
+    words += ["--levels", "64", "--updates", "2", "--measured", "8", "--folder", str(tmp_path / "kept")]
+    args = parser("equal").parse_args([*words, "--set", *TINY])
+    report = run(args)
+    names = [row[0] for row in report.tables[0].rows]
+    assert names[:3] == ["from scratch", "levels, clone", "levels, clone, reinforcement"]
+    scratch, tuned = report.results
+    assert scratch["before"] == 0 < tuned["before"] < 200
+    for each in report.results:
+        assert 150 < each["before"] + each["curve"][-1][SECONDS] < 220, "all stop near the limit"
+    for name, draw in report.plots.items():
+        draw(tmp_path / name)
+        assert (tmp_path / name).read_text().rstrip().endswith("</svg>")
+    assert run(args).results == report.results, "finished training and evaluations are kept"
