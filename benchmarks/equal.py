@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
+from threading import Lock
 from typing import Any, NamedTuple
 
 from benchmarks.cloning import SAMPLED, command, interval_text, kept
@@ -37,6 +38,7 @@ class Way(NamedTuple):
 
 
 CLONE = "clone"
+CLONING = Lock()  # several ways share a clone
 WAYS = {
     "from scratch": Way(SCRATCH, colour="#0072b2"),
     "from scratch, learnability": Way((*SCRATCH, "levels=learnability"), colour="#56b4e9"),
@@ -92,8 +94,9 @@ def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
     evaluate = partial(kept, folder.with_suffix(".json"))
     start, before, clone = WAYS[way].start, 0.0, None
     if start == CLONE:
-        start, before = cloned(args, seed)
-        clone = kept(args.folder / f"clone-{args.size}-{seed}.json", start, *measuring(args))
+        with CLONING:
+            start, before = cloned(args, seed)
+            clone = kept(args.folder / f"clone-{args.size}-{seed}.json", start, *measuring(args))
     curve = trained(args, folder, way, start, seed, args.core_seconds - before)
     rates = evaluate(folder, *measuring(args))
     return {"way": way, "seed": seed, "before": before, "curve": curve, "sealed": rates, "clone": clone}

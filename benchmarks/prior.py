@@ -139,7 +139,7 @@ def undecided(split: Path, count: int | None) -> Undecided:
         steps[these],
         searched[these],
         sum(sum(one.values()) for one in seconds),
-        rows["command"][0].as_py(),
+        rows["command"][0].as_py().replace(" levels=1", f" levels={count or len(labels)}"),
     )
 
 
