@@ -37,7 +37,7 @@ from levelproof.pipeline.runtime import own_cores, prepare_jax
 
 REPLAYS = 128  # of each solution, from starts perturbed by a rounding error
 PLOT = "late.png"
-COLUMNS, PIXELS = 8, 150  # columns of the sheet, two for each level; width of a picture
+COLUMNS, PIXELS = 4, 200  # columns of the sheet, two for each level; width of a picture
 HEAD = ("level", "bodies", "joints", "motors", "thrusters", "env steps of the search", "found by", "steps to goal",
         "changes of the action", "of its replays reach the goal")  # fmt: skip
 
@@ -196,5 +196,5 @@ def picture(level: Level, record: Any, index: int, step: int, name: str) -> Imag
 
 
 def write_sheet(pictures: list[Image.Image], path: Path) -> None:
-    """Write a sheet in few colours, which shrinks the file."""
-    sheet(pictures, COLUMNS).quantize(64).save(path, optimize=True)
+    """Write a sheet with a palette, which shrinks the file."""
+    sheet(pictures, COLUMNS).quantize(256).save(path, optimize=True)
