@@ -22,6 +22,7 @@ BENCHMARKS = {  # name: (module, what it measures)
     "solved": ("benchmarks.solved.command", "how many levels experts solve, how soon and at what cost"),
     "search": ("benchmarks.search", "how many more levels a longer search would solve"),
     "equal": ("benchmarks.equal", "learners at equal cost: what a core-hour gives, with and without data"),
+    "teaching": ("benchmarks.teaching", "which data teaches best: clones of several procedures' witnesses"),
     "late": ("benchmarks.late", "which levels only a long search solves, and how"),
     "prior": ("benchmarks.prior", "what attempts of a policy before the search would find and save"),
     "training": ("benchmarks.training", "env steps/s of rollout, update, and the program that does both"),
