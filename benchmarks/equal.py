@@ -26,6 +26,7 @@ LARGE = ("ppo.environments=2048", "ppo.epochs=2")  # fewer, larger steps than th
 SCRATCH = (*LARGE, "ppo.learning_rate=3e-4", "ppo.entropy_weight=0.005", "network.width=64")
 TUNING = (*LARGE, "ppo.learning_rate=2e-4", "ppo.entropy_weight=0.002", "ppo.critic_updates=5")
 PLOT = "equal.svg"
+SETTLED = 5  # updates, after which lines no longer favour short episodes
 PLAYERS = "random", "sticky random", "its own expert, 256k"
 
 
@@ -79,10 +80,11 @@ def run(args: argparse.Namespace) -> Report:
             "count. *Of all*: "
             f"{players[ALL]['random']['levels']:,} levels, of which some cannot be solved; *of solved*, and the best "
             f"of 8 attempts at them: the {players[SOLVED]['random']['levels']:,} that are labelled solved.",
-            *(f"{way}: `levelproof train size={args.size} {' '.join((*WAYS[way].settings, *args.set))}`."
+            *(f"{way}: `levelproof train size={args.size} cores=1 {' '.join((*WAYS[way].settings, *args.set))}`."
               for way in args.ways),
             f"![Share of episodes that reach the goal in training, against core-seconds]({PLOT})",
-            "The plot: each episode is in a random level never played before. Its first point favours short episodes.",
+            "In the plot, each episode is in a random level never played before, and the weights are those that act; "
+            "the table measures their average, which is what is saved.",
         ],
         plots={PLOT: partial(draw, results)},
     )  # fmt: skip
@@ -173,7 +175,8 @@ def draw(results: Sequence[Mapping[str, Any]], path: Path) -> None:
     plt = pyplot()
     figure, axes = plt.subplots(figsize=(6, 3.5), layout="constrained")
     for each in results:
-        points = [(each["before"] + line[SECONDS], 100 * line[RATE]) for line in each["curve"] if line.get(RATE)]
+        curve = [line for line in each["curve"] if line["train/updates"] > SETTLED]
+        points = [(each["before"] + line[SECONDS], 100 * line[RATE]) for line in curve if line.get(RATE)]
         label = each["way"] if each["seed"] == 0 else None
         axes.plot(*zip(*points, strict=True), color=WAYS[each["way"]].colour, label=label, linewidth=1)
     axes.set(xlim=(0, None), xlabel="core-seconds", ylabel="episodes that reach the goal, %")
