@@ -23,10 +23,9 @@ def run(arguments: argparse.Namespace) -> None:
 
     from levelproof.configs.compose import compose_clone
     from levelproof.pipeline.learn.clone import clone
-    from levelproof.pipeline.urls import require_known
+    from levelproof.pipeline.urls import parted, require_known
 
-    settings = [word for word in arguments.words if "=" in word and not Path(word).exists()]
-    splits = [Path(word) for word in dict.fromkeys(arguments.words) if word not in settings]
+    splits, settings = parted(dict.fromkeys(arguments.words))
     if not splits:
         raise UserError("There is no split to clone: name one, as in `levelproof clone data/128k/s`.")
     for split in splits:

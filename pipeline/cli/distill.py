@@ -23,10 +23,9 @@ def run(arguments: argparse.Namespace) -> None:
 
     from levelproof.configs.compose import compose_distill
     from levelproof.pipeline.learn.distill import distill
-    from levelproof.pipeline.urls import require_known
+    from levelproof.pipeline.urls import parted, require_known
 
-    settings = [word for word in arguments.words if "=" in word and not Path(word).exists()]
-    splits = [Path(word) for word in arguments.words if word not in settings]
+    splits, settings = parted(arguments.words)
     if len(splits) != 1:
         named = f"not {len(splits)}" if splits else "as in `levelproof distill data/128k/s`"
         raise UserError(f"Distilling takes the levels of one split: name one, {named}.")
