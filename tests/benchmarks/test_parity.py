@@ -313,6 +313,7 @@ class TestReport:
         assert result.defect.differ[0] >= result.defect.differ[1] > 0
         assert not report.fault
 
+    @pytest.mark.slow
     def test_report_faults_another_engine(self, pool) -> None:
         """Our engine with another constant: contacts are pushed apart a quarter faster."""
         params = Params(contact_bias=0.25)

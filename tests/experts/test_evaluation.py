@@ -50,6 +50,7 @@ def drawn(level_id: jax.Array, attempt: jax.Array) -> jax.Array:
     return jax.lax.map(draw, jnp.arange(RECORD_STEPS))
 
 
+@pytest.mark.slow
 def test_attempts_equal_a_plain_loop(levels: Level, played: evaluation.FirstEpisodes) -> None:
     """One lane, one step at a time, the actions drawn from the same keys."""
     step = jax.jit(partial(task.advance, params=DEFAULT_RULES))
@@ -67,6 +68,7 @@ def test_attempts_equal_a_plain_loop(levels: Level, played: evaluation.FirstEpis
         assert (goal, steps) == (played.solved[number, attempt], played.env_steps[number, attempt])
 
 
+@pytest.mark.slow
 def test_batches_change_no_result(levels: Level, played: evaluation.FirstEpisodes) -> None:
     order = np.random.default_rng(0).permutation(len(IDS))
     other = play(play_randomly, (), take(levels, order), IDS[order], ATTEMPTS, 1, DEFAULT_RULES, lanes=FEW)

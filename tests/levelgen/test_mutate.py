@@ -16,6 +16,8 @@ from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.quick import jit_once
 
+pytestmark = pytest.mark.slow
+
 idle = jit_once(stay_idle, static_argnames=("rules", "env_steps"))
 
 

@@ -115,6 +115,7 @@ def stickiness(first: int = 0) -> np.ndarray:
     return np.resize(np.roll(np.array([0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 1.0], np.float32), first), LANES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BRUTE_FORCE)
 def test_random_actions_never_contradict_a_proof(name: str) -> None:
     """The goal is never reached; and if nothing acts, episodes end as idle ones do."""
@@ -249,6 +250,7 @@ def test_actuator_out_of_reach_proves_nothing() -> None:
     assert proof(world(**arm, roles=(Role.GREEN, Role.BLUE, Role.PLAIN))) is Proof.NONE
 
 
+@pytest.mark.slow
 def test_huge_values_prove_nothing() -> None:
     """A thruster on an immovable body does nothing, unless its force is infinite: zero times infinity is NaN."""
     still = {"thruster": SQUARE, "fixed": (SQUARE,)}

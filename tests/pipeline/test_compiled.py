@@ -21,6 +21,7 @@ def programs(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.glob("*-cache")}
 
 
+@pytest.mark.slow
 def test_truncated_program_is_recompiled_without_a_warning(tmp_path: Path) -> None:
     folder = tmp_path / "jax"
     python(COMPILE, tmp_path)

@@ -32,6 +32,8 @@ from levelproof.pipeline.verify.verify import examine
 from tests.pipeline.command import here
 from tests.pipeline.made import honest_split, made_job, made_split, renamed_before
 
+pytestmark = pytest.mark.slow
+
 EARLIER = {new: old for old, new in RENAMED.items()}
 OLD, NEW = "moved_success_rate", "perturbed_success_rate"
 UNIT, UNITS = 16, 2
@@ -154,7 +156,6 @@ def test_regenerate_keeps_settings_with_old_names(tmp_path: Path) -> None:
     assert compose_job([*kept, "budget=128k"]).hash == made_job("data", *words).hash
 
 
-@pytest.mark.slow
 def test_old_seeds_open_and_grow(new: Path, seed: Path, tmp_path: Path) -> None:
     assert OLD in pq.read_schema(seed).names
     ours, theirs = levelproof.open(new, columns=[NEW]), levelproof.open(seed, columns=[NEW])

@@ -52,6 +52,7 @@ def test_xla_computes_on_one_thread(tmp_path: Path) -> None:
     assert int(python(COUNT, tmp_path)) <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux" or len(own_cores()) < 2, reason="reads /proc; needs a second core")
 def test_own_core_pins_no_worker_if_cores_are_left_over(tmp_path: Path) -> None:
     program = (
@@ -99,6 +100,7 @@ def test_own_cores_respect_a_containers_quota(monkeypatch: pytest.MonkeyPatch, q
         runtime.CLAIMS.pop().close()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="needs Linux's CPU affinity")
 def test_own_core_gives_each_worker_another_core(tmp_path: Path) -> None:
     """The affinity mask omits some cores; a worker's core is free again when it has died."""

@@ -14,6 +14,8 @@ from levelproof.levelgen.sampling.sampler import sample_levels, sampler
 from levelproof.levelgen.task.lanes import FIRST_EXTRA, ExtendedTable, Lanes
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 
+pytestmark = pytest.mark.slow
+
 CONFIG = ReplayConfig(capacity=4, full_enough=0.5, staleness=0.0)
 STALE = ReplayConfig(capacity=4, full_enough=0.5, staleness=1.0, share=0.99)
 KEY = jax.random.key(0)
@@ -108,7 +110,6 @@ def bred() -> tuple[Population, Population]:
     return now, EVOLVE.breed(now, np.random.default_rng(0))
 
 
-@pytest.mark.slow
 def test_children_take_the_slots_of_low_scores_and_wait() -> None:
     before, after = bred()
     new = np.asarray(waiting(after.buffer))
@@ -139,7 +140,6 @@ def test_a_child_is_scored_by_its_own_episodes_only() -> None:
     assert name + 32 not in scores(played), "an earlier or later child of the same slot is unknown"
 
 
-@pytest.mark.slow
 def test_lanes_play_children_and_random_levels_of_one_table() -> None:
     _, after = bred()
     slots = np.flatnonzero(waiting(after.buffer))[:2]

@@ -22,6 +22,8 @@ from levelproof.physics.types import FIXED_POLYGONS, State
 from tests.experts.networks.weights import random_weights
 from tests.quick import jit_once
 
+pytestmark = pytest.mark.slow
+
 LEVELS = 6
 NAMES = ["s", *(pytest.param(name, marks=pytest.mark.campaign) for name in "ml")]
 FROM_TANH = 1e-5  # float32, sums of a few hundred terms

@@ -18,6 +18,8 @@ from levelproof.levelgen.task.rules import reset
 from tests.experts.networks.weights import random_weights
 from tests.quick import jit_once
 
+pytestmark = pytest.mark.slow
+
 COUNT = 16
 
 
@@ -56,7 +58,6 @@ def shuffled(level: Level) -> Level:
     return replace(level, model=replace(model, **changed), state=replace(level.state, **moving), **of_task)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", [PolicyKind.ATTENTION, PolicyKind.INVARIANT, PolicyKind.TRANSFORMER])
 def test_order_of_entities_does_not_matter(kind: PolicyKind) -> None:
     levels, policy = levelproof.sample_levels(np.arange(COUNT), "m"), policy_of(kind)
@@ -66,7 +67,6 @@ def test_order_of_entities_does_not_matter(kind: PolicyKind) -> None:
     np.testing.assert_allclose(logits_of(policy.params, policy.network, other), logits, atol=2e-4)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("size", ["s", "8-0-1-0"])
 def test_attention_plays_any_size_and_idle_entries_are_zero(size: str) -> None:
     levels, policy = levelproof.sample_levels(np.arange(COUNT), size), policy_of(PolicyKind.ATTENTION)
@@ -110,7 +110,6 @@ def test_logits_differ_between_levels_and_states_of_a_lane_do_not_touch_others()
     np.testing.assert_allclose(among[:, [3] * COUNT], alone, atol=1e-5)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(PolicyKind))
 def test_saved_policy_gives_the_same_bits(kind: PolicyKind, tmp_path: Path) -> None:
     levels, policy = levelproof.sample_levels(np.arange(COUNT), "s"), policy_of(kind)

@@ -20,6 +20,8 @@ from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.experts.small import CONFIG, WHOLE, untouched
 from tests.experts.training.test_slots import SOLVED, same
 
+pytestmark = pytest.mark.slow
+
 IDS = np.arange(100, 136)
 UPDATES = 6
 
@@ -143,7 +145,6 @@ def chosen(levels: Level, i: int, trained: TrainedLevel) -> Witness:
     return witness
 
 
-@pytest.mark.slow
 def test_only_levels_with_fragile_witnesses_train_on(levels: Level) -> None:
     at_once, waited = (trained_by(steadied(updates), levels) for updates in (0, 3))
     left = [i for i, level in enumerate(at_once) if len(level.curve) < 10]
@@ -155,7 +156,6 @@ def test_only_levels_with_fragile_witnesses_train_on(levels: Level) -> None:
         assert stays or [witness.steps for witness in waited[i].candidates] == [best.steps]
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("never_portable")
 def test_stop_robustness_limits_further_training(levels: Level) -> None:
     """The learning curve extends the earlier one, and the best witness of all evaluations is kept."""
@@ -171,7 +171,6 @@ def test_stop_robustness_limits_further_training(levels: Level) -> None:
         assert (now.portability or 0, -now.steps) >= (best.portability or 0, -best.steps)
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("never_portable")
 def test_further_training_is_independent_of_neighbours_and_pauses(levels: Level) -> None:
     alone = trained_by(steadied(3), levels)

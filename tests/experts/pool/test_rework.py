@@ -23,6 +23,8 @@ from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.experts.random_play import random_successes, searched_randomly
 
+pytestmark = pytest.mark.slow
+
 IDS = np.array([3, 1522], np.int32)  # of size s: random play of the second survives few replays
 STEADY, FRAGILE = 0, 1
 PROCEDURE = Procedure(SearchConfig(env_steps=0), ExpertConfig(), StopConfig(rule=Rule.NONE))

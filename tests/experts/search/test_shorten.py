@@ -22,6 +22,8 @@ from levelproof.levelgen.level import ACTIONS, MOTOR_BINDINGS, Level, Role
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.experts.search.worlds import world
 
+pytestmark = pytest.mark.slow
+
 WIDTH = at_once(LANES, IN_CACHE)  # levels that one program polishes
 IDS = np.arange(WIDTH, dtype=np.int32)
 ENV_STEPS = 60_000
@@ -68,7 +70,6 @@ def polished() -> Shortened:
     return jax.device_get(polish(levels(), IDS, given(), ENV_STEPS, DEFAULT_RULES))
 
 
-@pytest.mark.slow
 def test_polish_finds_the_shortest_success() -> None:
     success, length = polished().success
     np.testing.assert_array_equal(length, shortest()[1])
@@ -95,7 +96,6 @@ def test_env_steps_are_limited() -> None:
     np.testing.assert_array_equal(few.success.length[1:], polished().success.length[1:])
 
 
-@pytest.mark.slow
 def test_replays_end_once_enough_lanes_have_reached_the_goal() -> None:
     """The first ones are the same as when all lanes play to the end; the others count as failures."""
     (action, steps), level = shortest(), take(levels(), np.zeros(1, int))

@@ -27,6 +27,8 @@ from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.experts.random_play import random_successes
 from tests.experts.small import CONFIG, IDS, SHAPED, WHOLE, untouched
 
+pytestmark = pytest.mark.slow
+
 SOLVED = StopConfig(rule=Rule.SOLVED, successes=2, share=0.6, wait=2048)
 HALVED = StopConfig(rule=Rule.HALVING, successes=4, first_rung=4 * 512, gain=10.0)
 UPDATES = 24  # 12,288 env steps
@@ -155,7 +157,6 @@ def test_polish_continues_training_after_a_level_is_solved(levels: Level, solved
         same(polished[i].evaluations[0], solved[i].evaluations[0])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("stopping", [WHOLE, SOLVED, HALVED], ids=["budget", "solved", "halving"])
 def test_continued_expert_equals_one_trained_without_a_break(levels: Level, stopping: StopConfig) -> None:
     """A level that left at a rung is over, and uses none of the larger budget."""
@@ -172,7 +173,6 @@ def test_continued_expert_equals_one_trained_without_a_break(levels: Level, stop
         same(level, through[i])
 
 
-@pytest.mark.slow
 def test_expert_rehearses_an_earlier_success_from_the_first_update(levels: Level, whole: list[TrainedLevel]) -> None:
     """The first episode repeats it to the goal; rehearsing lanes do not count as the expert's own."""
     findings = nothing_found(len(IDS))._replace(success=random_successes(levels, IDS))

@@ -23,6 +23,8 @@ from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.experts.random_play import random_successes, searched_randomly
 
+pytestmark = pytest.mark.slow
+
 REPLAYS = 8
 ROBUST, FRAGILE = 0, 2  # indices: random play of the first survives everything, of the other almost nothing
 IDS = np.array([3, 2, 107, 100, 9, 1], np.int32)  # of size s; the last is trivial
@@ -56,7 +58,6 @@ def starts(levels: Level) -> Level:
     return jax.device_get(replace(lanes, state=jax.jit(moved, static_argnums=2)(lanes, IDS[at], REPLAYS)))
 
 
-@pytest.mark.slow
 def test_portability_is_the_share_of_replays_that_reach_the_goal(
     starts: Level, witnesses: list[Witness], shares: np.ndarray
 ) -> None:

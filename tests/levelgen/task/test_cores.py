@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 PROGRAM = """
 import jax, numpy as np
 from jax.sharding import AxisType, PartitionSpec
@@ -34,7 +36,6 @@ print("equal")
 """
 
 
-@pytest.mark.slow
 def test_two_cores_give_the_same_bits_as_one() -> None:
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
     root = Path(__file__).parents[3]

@@ -45,6 +45,7 @@ def test_every_reset_draws_a_new_level() -> None:
                                   levels.state.position[..., fresh])  # fmt: skip
 
 
+@pytest.mark.slow
 def test_lanes_start_the_levels_whose_ids_they_are_given() -> None:
     env, params = levelproof.make("s", rules=RULES)
     lanes = levelproof.Lanes(env)

@@ -13,6 +13,8 @@ from levelproof.levelgen.task.environment import ActionType, make, starts
 from levelproof.levelgen.task.observe.kinds import ObservationType
 from levelproof.levelgen.task.to_gymnax import to_gymnax
 
+pytestmark = pytest.mark.slow
+
 gymnax = pytest.importorskip("gymnax")
 base = pytest.importorskip("gymnax.environments.environment")
 spaces = pytest.importorskip("gymnax.environments.spaces")

@@ -104,6 +104,7 @@ def test_programs_without_optimiser_multiply_no_floats(programs: list[Program]) 
         assert not rounding & {"mul", "dot_general", "exp", "log", "sin", "cos", "tanh", "erf_inv"}, program.name
 
 
+@pytest.mark.slow
 def test_programs_call_no_code_but_ours(programs: list[Program]) -> None:
     """LAPACK's factorisations wait for XLA's pool from within it, which is deadly where two workers share a process."""
     called = set[str]()

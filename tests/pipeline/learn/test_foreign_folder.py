@@ -13,6 +13,8 @@ from levelproof.pipeline.learn.clone import COURSE
 from levelproof.pipeline.learn.metrics import CURVES, LOG, METRICS, Metrics
 from tests.pipeline.planted import MINE, PLANTED, never_hangs, profile
 
+pytestmark = pytest.mark.slow
+
 __all__ = ["never_hangs", "profile"]  # fixtures
 
 NUMBERS = {COURSE.step: 20} | {f"bc/{kind}{name}": 0.5 for kind in ("", "validation_") for name in ("loss", "accuracy")}

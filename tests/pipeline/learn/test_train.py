@@ -60,6 +60,7 @@ def agent(easy: tuple[str, ...], tmp_path_factory: pytest.TempPathFactory) -> Pa
     return trained(tmp_path_factory.mktemp("trained"), 60, "interval=10", *easy)
 
 
+@pytest.mark.slow
 def test_solve_rate_rises_on_an_easy_set(agent: Path) -> None:
     curve = metrics(agent)
     assert [line["train/env_steps"] for line in curve] == [10 * PER_UPDATE * n for n in range(1, 7)]

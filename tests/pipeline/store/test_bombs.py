@@ -15,6 +15,8 @@ from levelproof.pipeline.store.manifest import fragment_paths, read_fragment
 from levelproof.pipeline.store.shard import Shard
 from tests.pipeline.made import made_job, made_split
 
+pytestmark = pytest.mark.slow
+
 MAX_MEMORY = 2**27  # bytes
 
 
