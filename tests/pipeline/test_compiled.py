@@ -4,6 +4,8 @@ import os
 import time
 from pathlib import Path
 
+import pytest
+
 from levelproof.pipeline.runtime import LAST_CHECK, remove_damaged
 from tests.pipeline.test_runtime import python
 
