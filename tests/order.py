@@ -28,7 +28,7 @@ TOGETHER = {
     "experts": ("tests/experts",),
     "look": ("tests/pipeline/look/test_show", "tests/pipeline/look/test_gallery"),
 }
-FIRST, BESIDE = "jobs", "tests/physics/"
+FIRST, BESIDE, LONG = "jobs", "tests/physics/", "tests/pipeline/learn/"  # LONG: few tests, which train
 DESELECTED = pytest.StashKey[int]()
 BEGAN = time.monotonic()
 
@@ -53,11 +53,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def by_weight(items: list[pytest.Item]) -> dict[str, Any]:
-    """Return a sort key per group: groups with many tests come early, so that none is left for a single process at the
-    end; groups that compile without XLA's optimiser come after the others."""
+    """Return a sort key per group: long groups and those with many tests come early, so that none is left for a single
+    process at the end; groups that compile without XLA's optimiser come after the others."""
     count = Counter(group_of(item.nodeid) for item in items)
     brief = {group_of(item.nodeid) for item in items if is_brief(item.nodeid)}
-    return {group: (group != FIRST, not group.startswith(BESIDE), group in brief, -count[group]) for group in count}
+    late = lambda group: (group != FIRST, not group.startswith(BESIDE), group in brief, not group.startswith(LONG))
+    return {group: (*late(group), -number) for group, number in count.items()}
 
 
 def shuffled(items: list[pytest.Item], seed: str) -> dict[str, int]:
