@@ -298,7 +298,6 @@ def answers(split: Path) -> dict[str, object]:
     return {"facts": facts, "rows": rows, "files": files, "status": here(["status", name], folder).stdout}
 
 
-@pytest.mark.slow
 def test_sealed_split_gives_the_same_answers_and_grows(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, before = split.parents[2], answers(split)
     done = here(["seal", "data/5k/s", "--rows", "3"], folder)
