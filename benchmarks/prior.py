@@ -19,6 +19,7 @@ from levelproof.experts.labels import Label
 from levelproof.experts.networks.saved import Policy
 from levelproof.levelgen.level import Level, name_of
 from levelproof.levelgen.task.rules import TaskParams
+from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.read.levels import COLUMNS, levels_of, rules_of
 from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.runtime import prepare_jax
@@ -128,6 +129,8 @@ def undecided(split: Path, count: int | None) -> Undecided:
     rows = manifest.table.sort_by("level_id").slice(0, count)
     steps = np.array(rows["steps_to_goal"].to_pylist(), float)
     seconds = rows["seconds"].to_pylist()
+    if None in seconds:
+        raise UserError(f"{split} does not say what its levels cost: name a split that `levelproof generate` wrote.")
     labels, searched = rows["label"].to_pylist(), np.array([one["search"] for one in seconds])
     these = np.flatnonzero([label in UNDECIDED for label in labels])
     rows = rows.take(these)

@@ -8,13 +8,20 @@ import pytest
 from benchmarks.__main__ import parser
 from benchmarks.prior import run, undecided
 from levelproof.pipeline.store.manifest import require_manifest
-from tests.pipeline.made import honest_split
+from tests.pipeline.command import here
 
 pytestmark = pytest.mark.campaign
 
 
-def test_counts_and_seconds_are_those_of_the_manifest(tmp_path: Path) -> None:
-    split = honest_split(tmp_path / "data", 32, 1)
+@pytest.fixture(scope="module")
+def split(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("prior")
+    done = here(["generate", "levels=32", "budget=5k", "procedure=label", "executor=inline"], folder)
+    assert done.returncode == 0, done.stderr
+    return folder / "data/5k/s"
+
+
+def test_counts_and_seconds_are_those_of_the_manifest(split: Path) -> None:
     args = parser("prior").parse_args(["prior", str(split), "--attempts", "64"])
     (one,) = run(args).results
     table = require_manifest(split, ["label", "seconds"]).table
@@ -25,7 +32,6 @@ def test_counts_and_seconds_are_those_of_the_manifest(tmp_path: Path) -> None:
     assert one["everything"] == pytest.approx(sum(sum(row.values()) for row in table["seconds"].to_pylist()))
 
 
-def test_first_levels_are_those_of_the_lowest_ids(tmp_path: Path) -> None:
-    split = honest_split(tmp_path / "data", 32, 1)
+def test_first_levels_are_those_of_the_lowest_ids(split: Path) -> None:
     everything, some = undecided(split, None), undecided(split, 16)
     np.testing.assert_array_equal(some.level_ids, everything.level_ids[everything.level_ids < 16])

@@ -1,5 +1,6 @@
 """The benchmark of data that teaches, on clones of two updates."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -17,5 +18,7 @@ def test_clones_learn_from_the_same_levels(tmp_path: Path) -> None:
     default, label = report.tables[0].rows
     assert (default[0], label[0]) == ("default", "label")
     assert float(default[1]) > float(label[1]) > 0, "experts cost more than a short search"
-    assert "the same 4" in report.notes[0], "some 40 of 64 levels are solved"
+    common = re.search(r"the same (\d+) levels", report.notes[0])
+    assert common
+    assert 30 <= int(common[1]) <= 45, "some 40 of 64 levels are solved"
     assert run(args).tables == report.tables, "finished clones and evaluations are kept"
