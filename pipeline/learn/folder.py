@@ -3,7 +3,7 @@
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -30,18 +30,26 @@ def made(out: Path) -> Path:
     return out
 
 
-def require_same_run(
-    out: Path, note: dict[str, Any], compared: Callable[[dict[str, Any]], Any] = lambda note: note
-) -> None:
+def require_same_run(out: Path, note: dict[str, Any], free: Sequence[str] = ()) -> None:
     """Raise UserError if `out` holds a run of other settings or data, or a policy of unknown origin.
 
-    `compared` returns what of a note must be equal.
+    `free` is the path, name by name, of a value in the note that may differ.
     """
     if (before := note_in(out)) is None:
         if (out / CONFIG).exists():
             raise UserError(f"{out} has a policy already: choose another folder with -o.")
-    elif compared(before) != compared(note):
+    elif _without(before, free) != _without(note, free):
         raise UserError(f"{out} has a run with other settings or levels: repeat its command, or choose another -o.")
+
+
+def _without(note: Any, path: Sequence[str]) -> Any:
+    """Return JSON without the value at a path of names; as it is if it has none, as in another command's note."""
+    if not path or not isinstance(note, dict):
+        return note
+    name, *inner = path
+    return {
+        key: _without(value, inner) if key == name else value for key, value in note.items() if inner or key != name
+    }
 
 
 def note_in(out: Path) -> dict[str, Any] | None:

@@ -55,6 +55,7 @@ COURSE = Curves(
     ),
     {GREEN: "solve rate", BLUE: "entropy"},
 )
+LATER = ("settings", "ppo", "env_steps")  # in the note: where training ends, which a resumed run may move
 WITHOUT_EFFECT = ("log", "cores")  # settings that a resumed run may change; the number of cores is noted separately
 
 
@@ -76,7 +77,7 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
     note = note_of(config, source, cores)
     params = None if start is None else start.params
     with explaining_writes(out), only_clone(made(out)) as require_ours:
-        require_same_run(out, note, endless)
+        require_same_run(out, note, LATER)
         table = table_of(source.levels, recipe.rules)
         programs = programs_of(recipe, table, params, cores)
         fresh = programs.begin(table, params)
@@ -155,13 +156,6 @@ def note_of(config: TrainConfig, source: TrainingLevels, cores: int) -> dict[str
         "start": weights_digest(config.start),
         "cores": cores,
     }
-
-
-def endless(note: dict[str, Any]) -> dict[str, Any]:
-    """Return a run's note without the env steps after which it ends, which a resumed run may change."""
-    settings = note["settings"]
-    ppo = {name: value for name, value in settings["ppo"].items() if name != "env_steps"}
-    return note | {"settings": settings | {"ppo": ppo}}
 
 
 def update_until_done(

@@ -240,6 +240,13 @@ def test_folder_of_another_run_is_refused(agent: Path, easy: tuple[str, ...], tm
     assert_refused(here(["train", *LANES, *easy, "seed=1"], tmp_path), 2, "has a run with other settings or levels")
 
 
+@pytest.mark.parametrize("note", [{"splits": [], "settings": {"where": ""}}, {"settings": {"ppo": 1}}, []])
+def test_folder_with_the_note_of_another_command_is_refused(note: Any, tmp_path: Path) -> None:
+    (tmp_path / "agent").mkdir()
+    (tmp_path / "agent" / "run.json").write_text(json.dumps(note))
+    assert_refused(here(["train", *LANES, *TINY], tmp_path), 2, "has a run with other settings or levels")
+
+
 def test_guide_lists_every_setting_with_its_default_and_meaning() -> None:
     guide = (ROOT / "docs/finetune.md").read_text()
     groups = {"": TrainConfig, "ppo.": PPOConfig, "curriculum.": CurriculumConfig}
