@@ -93,14 +93,13 @@ def run(args: argparse.Namespace) -> Report:
 def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
     """Make one policy, and measure it and its clone on sealed levels."""
     folder = args.folder / f"{way.replace(', ', '-').replace(' ', '-').replace(':', '-')}-{args.size}-{seed}"
-    evaluate = partial(kept, folder.with_suffix(".json"))
     start, before, clone = WAYS[way].start, 0.0, None
     if start == CLONE:
         with CLONING:
             start, before = cloned(args, seed)
             clone = kept(args.folder / f"clone-{args.size}-{seed}.json", start, *measuring(args))
     curve = trained(args, folder, way, start, seed, args.core_seconds - before)
-    rates = evaluate(folder, *measuring(args))
+    rates = kept(folder.with_suffix(".json"), folder, *measuring(args))
     return {"way": way, "seed": seed, "before": before, "curve": curve, "sealed": rates, "clone": clone}
 
 
@@ -132,9 +131,9 @@ def trained(
     words = [f"size={args.size}", f"seed={seed}", "cores=1", "interval=5", *WAYS[way].settings, *args.set]
     if start:
         words.append(f"start={start}")
-    curve, steps = lines_of(policy) if policy.exists() else [], 1
+    curve = lines_of(policy)
+    steps = curve[-1][STEPS] if curve else 1
     while True:
-        steps = max(steps, *(line[STEPS] for line in curve[-1:]), 1)
         command("train", *words, f"ppo.env_steps={int(steps)}", "-o", policy)
         curve = lines_of(policy)
         first, last = curve[0], curve[-1]
@@ -160,7 +159,7 @@ def rows_of(each: Mapping[str, Any]) -> list[list[str]]:
     """Return the rows of a policy: of its clone, if it has one, and of itself."""
     last, rows = each["curve"][-1], []
     if each["clone"]:
-        rows.append(row_of(f"{each['way'].rpartition(', ')[0]}", ("0", "", f"{each['before']:,.0f}"), each["clone"]))
+        rows.append(row_of(each["way"].rpartition(", ")[0], ("0", "", f"{each['before']:,.0f}"), each["clone"]))
     cost = f"{last[STEPS]:,}", f"{each['before']:,.0f}", f"{each['before'] + last[SECONDS]:,.0f}"
     return [*rows, row_of(each["way"], cost, each["sealed"])]
 

@@ -142,7 +142,7 @@ def undecided(split: Path, count: int | None) -> Undecided:
         steps[these],
         searched[these],
         sum(sum(one.values()) for one in seconds),
-        rows["command"][0].as_py().replace(" levels=1", f" levels={count or len(labels)}"),
+        rows["command"][0].as_py().replace(" levels=1", f" levels={len(labels)}"),
     )
 
 
