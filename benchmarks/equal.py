@@ -5,7 +5,6 @@ training from its checkpoint, and the folder keeps finished evaluations.
 """
 
 import argparse
-import json
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -13,8 +12,8 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
 
-from benchmarks.cloning import SAMPLED, command, interval_text, kept
-from benchmarks.learners import ATTEMPTS, RATE, SECONDS, STEPS
+from benchmarks.cloning import SAMPLED, command, kept
+from benchmarks.learners import ATTEMPTS, RATE, SECONDS, STEPS, add_ways, lines_of, rates_text, slug
 from benchmarks.plotting import pyplot
 from benchmarks.report import Report, Table
 from levelproof.pipeline.learn.evaluate import ALL, SOLVED
@@ -50,15 +49,10 @@ WAYS = {
 
 
 def register(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=list(WAYS), help="default: all")
-    parser.add_argument("--size", default="s", help="size of the levels (default: s)")
+    add_ways(parser, WAYS, "equal")
     parser.add_argument("--core-seconds", type=float, default=3600, help="of each policy (default: 3600)")
-    parser.add_argument("--seeds", type=int, default=1, help="policies of each way (default: 1)")
     parser.add_argument("--levels", default="8k", help="levels to search for a clone (default: 8k)")
     parser.add_argument("--updates", type=int, default=1500, help="updates of a clone (default: 1500)")
-    parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of all training")
-    parser.add_argument("--measured", type=int, default=2048, help="sealed levels to measure on (default: 2048)")
-    parser.add_argument("--folder", type=Path, default=Path("equal"), help="where data and policies are kept")
 
 
 def run(args: argparse.Namespace) -> Report:
@@ -92,7 +86,7 @@ def run(args: argparse.Namespace) -> Report:
 
 def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
     """Make one policy, and measure it and its clone on sealed levels."""
-    folder = args.folder / f"{way.replace(', ', '-').replace(' ', '-').replace(':', '-')}-{args.size}-{seed}"
+    folder = args.folder / f"{slug(way)}-{args.size}-{seed}"
     start, before, clone = WAYS[way].start, 0.0, None
     if start == CLONE:
         with CLONING:
@@ -149,12 +143,6 @@ def trained(
             steps = last[STEPS] + left * rate // update * update
 
 
-def lines_of(policy: Path) -> list[dict[str, float]]:
-    """Return the lines of a run's metrics; none if it has not begun."""
-    file = policy / "metrics.jsonl"
-    return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
-
-
 def rows_of(each: Mapping[str, Any]) -> list[list[str]]:
     """Return the rows of a policy: of its clone, if it has one, and of itself."""
     last, rows = each["curve"][-1], []
@@ -165,8 +153,7 @@ def rows_of(each: Mapping[str, Any]) -> list[list[str]]:
 
 
 def row_of(name: str, cost: Sequence[str], rates: Mapping[str, Any], player: str = SAMPLED) -> list[str]:
-    ways = ((ALL, "once"), (SOLVED, "once"), (SOLVED, "best"))
-    return [name, *cost, *(interval_text(rates[levels][player][key]) for levels, key in ways)]
+    return [name, *cost, *rates_text(rates, player)]
 
 
 def draw(results: Sequence[Mapping[str, Any]], path: Path) -> None:

@@ -5,7 +5,7 @@ A stopped run resumes: `levelproof train` resumes from its checkpoint, and the f
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -37,13 +37,18 @@ STEPS, SECONDS, RATE = "train/env_steps", "train/core_seconds", "train/solve_rat
 
 
 def register(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=list(WAYS), help="default: all")
-    parser.add_argument("--size", default="s", help="size of the levels (default: s)")
+    add_ways(parser, WAYS, "learners")
     parser.add_argument("--env-steps", default="10M", help="env steps of each policy (default: 10M)")
+
+
+def add_ways(parser: argparse.ArgumentParser, ways: Collection[str], folder: str) -> None:
+    """Add the arguments of a benchmark that trains policies in several ways."""
+    parser.add_argument("--ways", nargs="+", choices=list(ways), default=list(ways), help="default: all")
+    parser.add_argument("--size", default="s", help="size of the levels (default: s)")
     parser.add_argument("--seeds", type=int, default=1, help="policies of each way (default: 1)")
-    parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of all")
+    parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of all training")
     parser.add_argument("--measured", type=int, default=2048, help="sealed levels to measure on (default: 2048)")
-    parser.add_argument("--folder", type=Path, default=Path("learners"), help="where policies are kept")
+    parser.add_argument("--folder", type=Path, default=Path(folder), help="where everything is kept")
 
 
 def run(args: argparse.Namespace) -> Report:
@@ -75,12 +80,22 @@ def run(args: argparse.Namespace) -> Report:
 
 def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
     """Train one policy, and measure it on sealed levels."""
-    policy = args.folder / f"{way.replace(', ', '-').replace(' ', '-').replace(':', '-')}-{seed}"
+    policy = args.folder / f"{slug(way)}-{seed}"
     steps = f"ppo.env_steps={parse_count(args.env_steps, '--env-steps')}"
     command("train", f"size={args.size}", steps, f"seed={seed}", "cores=1", *WAYS[way], *args.set, "-o", policy)
-    curve = [json.loads(line) for line in (policy / "metrics.jsonl").read_text().splitlines()]
-    curve = [{name: line.get(name) for name in (STEPS, SECONDS, RATE)} for line in curve]
+    curve = [{name: line.get(name) for name in (STEPS, SECONDS, RATE)} for line in lines_of(policy)]
     return {"way": way, "seed": seed, "curve": curve, "sealed": evaluated(args, policy / "sealed.json", policy)}
+
+
+def slug(name: str) -> str:
+    """Return a name as the files and folders of a benchmark have it."""
+    return name.replace(", ", "-").replace(" ", "-").replace(":", "-")
+
+
+def lines_of(policy: Path) -> list[dict[str, float]]:
+    """Return the lines of a run's metrics; none if it has not begun."""
+    file = policy / "metrics.jsonl"
+    return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
 
 
 def evaluated(args: argparse.Namespace, file: Path, policy: Path | str) -> dict[str, Any]:
@@ -93,8 +108,13 @@ def row_of(name: str, trained: dict[str, Any] | None, rates: dict[str, Any], pla
     if trained:
         last = trained["curve"][-1]
         cost = (f"{last[STEPS]:,}", f"{last[SECONDS]:,.0f}")
+    return [name, *cost, *rates_text(rates, player)]
+
+
+def rates_text(rates: Mapping[str, Any], player: str) -> list[str]:
+    """Return the rates of one attempt at all levels, of one at those labelled solved, and of the best at these."""
     ways = ((ALL, "once"), (SOLVED, "once"), (SOLVED, "best"))
-    return [name, *cost, *(interval_text(rates[levels][player][key]) for levels, key in ways)]
+    return [interval_text(rates[levels][player][key]) for levels, key in ways]
 
 
 def draw(results: Sequence[dict[str, Any]], path: Path) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cloning import GREEDY, SAMPLED, command, interval_text, kept
+from benchmarks.learners import slug
 from benchmarks.report import Report, Table
 from levelproof.pipeline.learn.evaluate import SOLVED
 from levelproof.pipeline.runtime import own_cores
@@ -87,10 +88,6 @@ def measured(args: argparse.Namespace, data: Mapping[str, Any], common: Sequence
     command("clone", data["split"], "-o", policy, chosen, f"train.updates={args.updates}", f"seed={seed}", *args.set)
     words = "--attempts", ATTEMPTS, "--levels", args.measured
     return {"data": name, "seed": seed, "sealed": kept(policy / "sealed.json", policy, *words)}
-
-
-def slug(name: str) -> str:
-    return name.replace(", ", "-")
 
 
 def facts(data: Mapping[str, Any], common: set[int]) -> list[str]:

@@ -1,8 +1,6 @@
 """Paths that represent URLs, such as `Path("s3://bucket/split")`, although `Path` collapses their slashes."""
 
-import os
 import re
-from collections.abc import Iterable
 from pathlib import Path
 
 from levelproof.pipeline.errors import UserError
@@ -34,10 +32,3 @@ def require_policy(path: Path) -> None:
     """Raise UserError as `require_known`, but take the name of a policy that comes with levelproof for no URL."""
     if not str(path).startswith(BUILTIN):
         require_known(path)
-
-
-def parted(words: Iterable[str]) -> tuple[list[Path], list[str]]:
-    """Part a command's words into splits and settings; a word with "=" is a split only if it exists."""
-    # Unlike Path.exists, os.path.exists does not raise for a word that is too long for a path, such as a list of ids
-    settings = [word for word in words if "=" in word and not os.path.exists(word)]
-    return [Path(word) for word in words if word not in settings], settings

@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from levelproof.pipeline.cli.command import parted
 from levelproof.pipeline.errors import UserError
 
 SUMMARY = "train one policy for all levels on the witnesses of splits"
@@ -23,7 +24,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     from levelproof.configs.compose import compose_clone
     from levelproof.pipeline.learn.clone import clone
-    from levelproof.pipeline.urls import parted, require_known
+    from levelproof.pipeline.urls import require_known
 
     splits, settings = parted(dict.fromkeys(arguments.words))
     if not splits:

@@ -1,8 +1,9 @@
 """Arguments and text formatting that several commands share."""
 
 import argparse
+import os
 import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
 EXITS = "exit codes: 0 done, 1 failed, 2 change the command,\n            3 some units quarantined, 130 interrupted"
@@ -20,6 +21,13 @@ def add_out(parser: argparse.ArgumentParser, default: str, kinds: str = "") -> N
 
 def add_json(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def parted(words: Collection[str]) -> tuple[list[Path], list[str]]:
+    """Part a command's words into splits and settings; a word with "=" is a split only if it exists."""
+    # Unlike Path.exists, os.path.exists does not raise for a word that is too long for a path, such as a list of ids
+    settings = [word for word in words if "=" in word and not os.path.exists(word)]
+    return [Path(word) for word in words if word not in settings], settings
 
 
 def listed(entries: Iterable[tuple[str, str]], columns: int, indent: int) -> Iterator[str]:

@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from levelproof.pipeline.cli.command import parted
 from levelproof.pipeline.errors import UserError
 
 SUMMARY = "train one policy on labels that teachers give at its own states"
@@ -23,7 +24,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     from levelproof.configs.compose import compose_distill
     from levelproof.pipeline.learn.distill import distill
-    from levelproof.pipeline.urls import parted, require_known
+    from levelproof.pipeline.urls import require_known
 
     splits, settings = parted(arguments.words)
     if len(splits) != 1:

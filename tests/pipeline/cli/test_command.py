@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from levelproof.pipeline.urls import parted
+from levelproof.pipeline.cli.command import parted
 
 
 def test_words_with_an_equals_sign_are_settings_unless_they_exist(
