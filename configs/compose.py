@@ -234,7 +234,7 @@ def compose_train(overrides: Sequence[str]) -> "TrainConfig":
     config = _changed(TrainConfig, parsed)
     names = [override.key_or_group for override in parsed]
     random = config.levels in CURRICULA
-    useless = ("where",) if random else ("size", "distribution")
+    useless = ("where", "starts") if random else ("size", "distribution")
     for name in names:
         if name.partition(".")[0] in useless:
             kind = "random levels" if random else "the levels of a split or of files"

@@ -20,6 +20,7 @@ class TrainConfig:
     size: str = "s"  # size of random levels
     distribution: str = "kinetix"  # preset of random levels
     where: str = "label NOT IN ('trivial', 'unsolvable')"  # SQL condition that selects levels of a split
+    starts: int = 1  # states in which a split's levels start: theirs, and evenly spaced ones along their witness
     start: str = ""  # folder of a policy to continue training, with its network; empty: from scratch
     cores: int = 0  # CPU cores; 0: as many as divide the lanes evenly; a resumed run keeps its number
     interval: int = 25  # updates between lines of metrics, each with a checkpoint
@@ -32,7 +33,7 @@ class TrainConfig:
     evolve: EvolveConfig = field(default_factory=EvolveConfig)  # new levels with levels=evolve
 
     def __post_init__(self) -> None:
-        require(self, ("interval",), 1)
+        require(self, ("interval", "starts"), 1)
         require(self, ("cores",), 0, 1024)
         require(self, ("seed",), 0, 2**31 - 1)
         if not self.levels:

@@ -16,7 +16,7 @@ from levelproof.levelgen.level import Level, name_of
 from levelproof.levelgen.sampling.sampler import Sampler, sampler
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.learn.measured import is_split, levels_in
+from levelproof.pipeline.learn.measured import MeasuredLevels, is_split, levels_in, midway_levels
 from levelproof.pipeline.learn.sealed import require_not_sealed, require_some_usable, without_sealed
 
 
@@ -39,23 +39,33 @@ def levels_for(config: TrainConfig, tell: Callable[[str], None]) -> TrainingLeve
     if config.levels in CURRICULA:
         return _random(config)
     place = Path(config.levels)
-    split = is_split(place)
-    groups = list(levels_in(place, config.where or None if split else None, None, tell))
+    split, groups = is_split(place), _groups(config, tell)
+    if split:
+        require_not_sealed(place, groups[0].level_ids)
+    hashes = np.array(content_hashes(groups[0].levels))
+    usable = without_sealed(place, hashes, groups[0].levels.size, tell)
+    require_some_usable(place, usable)
+    parts = [take(group.levels, np.flatnonzero(usable)) for group in groups]
+    levels = jax.device_put(jax.tree.map(lambda *xs: np.concatenate(xs, -1), *parts))
+    digest = hashlib.sha256("".join(hashes[usable]).encode()).hexdigest()[:16]
+    facts = {"levels": str(place), "count": len(parts[0]), "content": digest}
+    return TrainingLevels(str(place), levels, groups[0].rules, facts)
+
+
+def _groups(config: TrainConfig, tell: Callable[[str], None]) -> list[MeasuredLevels]:
+    """Return the levels of a split or of files; of a split the levels' start first, then each state midway."""
+    place, where = Path(config.levels), config.where or None
+    if is_split(place) and config.starts > 1:
+        return [midway_levels(place, where, None, share / config.starts) for share in range(config.starts)]
+    if config.starts > 1:
+        raise UserError(f"starts={config.starts} needs witnesses, but {place} is not a split: leave it out.")
+    groups = list(levels_in(place, where if is_split(place) else None, None, tell))
     if len(groups) > 1:
         sizes = ", ".join(name_of(group.levels.size) for group in groups)
         raise UserError(
             f"{place} has levels of the sizes {sizes}: train on files of one size, in a folder of their own."
         )
-    (group,) = groups
-    if split:
-        require_not_sealed(place, group.level_ids)
-    hashes = np.array(content_hashes(group.levels))
-    usable = without_sealed(place, hashes, group.levels.size, tell)
-    require_some_usable(place, usable)
-    levels = jax.device_put(take(group.levels, np.flatnonzero(usable)))
-    digest = hashlib.sha256("".join(hashes[usable]).encode()).hexdigest()[:16]
-    facts = {"levels": str(place), "count": len(levels), "content": digest}
-    return TrainingLevels(str(place), levels, group.rules, facts)
+    return groups
 
 
 def _random(config: TrainConfig) -> TrainingLevels:

@@ -196,6 +196,11 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert np.array_equal(source.levels.state.position, data.levels(np.arange(len(ids))).state.position)
     fewer = levels_for(TrainConfig(levels=str(split), where=f"label = 'solved' AND level_id > {ids[0]}"), print)
     assert source.facts["content"] != fewer.facts["content"]
+    midway = levels_for(TrainConfig(levels=str(split), where="label = 'solved'", starts=2), print)
+    assert midway.facts == source.facts, "starts is among the settings of the note"
+    at = np.array(data.manifest["steps_to_goal"].to_pylist()) // 2
+    half = np.moveaxis(data.state(np.arange(len(ids)), at).level.state.position, 0, -1)
+    assert np.array_equal(midway.levels.state.position, np.append(source.levels.state.position, half, -1))
     export(split, ids[0], tmp_path / "level.json")
     of_files = levels_for(TrainConfig(levels=str(tmp_path)), messages.append)
     assert of_files.facts["count"] == 1
@@ -215,6 +220,9 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (["levels=learnabilty"], "There are no levels at learnabilty"),
         (["size=s", "levels=some/split"], "size has no effect"),
         (["where=label = 'solved'"], "where has no effect on random levels"),
+        (["starts=4"], "starts has no effect on random levels"),
+        (["starts=0", "levels=some/split"], "starts is 0"),
+        (["starts=2", "levels=file"], "starts=2 needs witnesses, but file is not a split"),
         (["curriculum.keep=4"], "no effect with levels=uniform"),
         (["levels=replay", "replay.share=1"], "share is 1"),
         (["levels=replay", "evolve.edits=4"], "no effect with levels=replay"),
