@@ -11,6 +11,7 @@ EXAMPLE = """\
 levelproof evaluate policy/
 levelproof evaluate policy/ --on data/128k/s --where "label = 'solved'" --start 0 0.5
 levelproof evaluate policy/ --on handmade
+levelproof evaluate my_agent.py --attempts 4
 levelproof evaluate policy/ --on sealed/64k/s --experts sealed/16k/s sealed/64k/s
 levelproof evaluate --on my-levels --json"""
 ON = (
@@ -21,7 +22,7 @@ ON = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     wrote = "folder of a policy that `levelproof clone` or `levelproof train` wrote"
-    policy = f"{wrote}, or builtin:s (default: only the baselines play)"
+    policy = f"{wrote}, builtin:s, or a Python file that defines `act` (default: only the baselines play)"
     parser.add_argument("policy", type=Path, nargs="?", metavar="POLICY", help=policy)
     parser.add_argument("--on", default="sealed", metavar="LEVELS", help=ON)
     parser.add_argument("--where", metavar="SQL", help="use only levels of the split that meet this condition")

@@ -31,6 +31,8 @@ from levelproof.pipeline.learn.measured import MeasuredLevels, is_split, levels_
 from levelproof.pipeline.learn.published import PROTOCOLS, published_levels
 from levelproof.pipeline.learn.solve_rates import Solved, solve_rates
 from levelproof.pipeline.learn.specialists import Specialists, sealed_specialists, specialists_of
+from levelproof.pipeline.read.agents import SUFFIX as AGENT_SUFFIX
+from levelproof.pipeline.read.agents import agent_in
 from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.words import many
@@ -38,7 +40,7 @@ from levelproof.pipeline.words import many
 SEALED = "sealed"
 ATTEMPTS = 8
 WIDE = 120  # columns of a table that no terminal shows: in 80, Rich would cut long rates
-NOTHING = "doing nothing"
+NOTHING, SAMPLED, AGENT = "doing nothing", "policy, sampled", "agent"
 ALL, NOT_TRIVIAL, SOLVED = "all", "that doing nothing does not solve", "labelled solved"  # denominators
 
 
@@ -57,7 +59,7 @@ def evaluate(
     """Play levels, and print a table of solve rates or JSON.
 
     Args:
-        policy: folder of a policy; None: baselines only.
+        policy: folder of a policy, or a Python file with an agent; None: baselines only.
         on: SEALED, a name in PROTOCOLS, a split, or a folder of level files.
         where: SQL condition that selects levels of a split.
         sizes: sizes of the sealed or published levels; None: s of the sealed, all of the published.
@@ -69,12 +71,13 @@ def evaluate(
         as_json: whether to print JSON instead of tables.
 
     Raises:
-        UserError: the policy or the levels do not exist, or do not fit each other.
+        UserError: the policy or the levels do not exist, or do not fit each other; or the agent fails.
         Failure: the split is damaged.
     """
     prepare_jax()
-    loaded = policy_at(policy) if policy else None
-    entrants = _entrants(loaded)
+    agent = agent_in(policy) if policy and policy.suffix == AGENT_SUFFIX else None
+    loaded = policy_at(policy) if policy and not agent else None
+    entrants = _entrants(loaded) | ({AGENT: _Entrant(agent)} if agent else {})
     console = Console(stderr=True)
     facts = []
     if attempts is None:
@@ -85,8 +88,12 @@ def evaluate(
         own = sealed_specialists(name_of(group.levels.size), len(group.level_ids), attempts) if on == SEALED else []
         own += [specialists_of(split, group.level_ids, attempts) for split in experts]
         facts.append(_measured(group, entrants, own, attempts, seed, console))
-    if policy and on == SEALED and (looks := log_look(policy, facts, attempts, seed)):
-        say(console, f"Look {looks} at the sealed levels; {policy / LOOKS} lists all of this policy.")
+        if agent and agent.error:
+            raise UserError(f"{agent.error}.")
+    if policy and on == SEALED:
+        log, name = (policy.with_suffix(f".{LOOKS}"), AGENT) if agent else (policy / LOOKS, SAMPLED)
+        if looks := log_look(log, name, facts, attempts, seed):
+            say(console, f"Look {looks} at the sealed levels; {log} lists all of this policy.")
     if as_json:
         json.dump({"policy": policy and str(policy), "attempts": attempts, "seed": seed, "levels": facts}, sys.stdout)
         print()
@@ -142,7 +149,7 @@ def _entrants(policy: Policy | None) -> dict[str, _Entrant]:
         "sticky random": _Entrant(play_sticky),
     }
     if policy:
-        entrants["policy, sampled"] = _Entrant(play_sampled(policy.network), policy.params)
+        entrants[SAMPLED] = _Entrant(play_sampled(policy.network), policy.params)
         entrants["policy, greedy"] = _Entrant(play_most_probable(policy.network), policy.params, chance=False)
     return entrants
 

@@ -17,11 +17,12 @@ from levelproof.pipeline.store.files import write
 LOOKS = "looks.jsonl"
 
 
-def log_look(policy: Path, groups: Sequence[Mapping[str, Any]], attempts: int, seed: int) -> int | None:
-    """Add a line to a policy's log; return how many it has. None: the folder cannot be written, and nothing was.
+def log_look(looks: Path, player: str, groups: Sequence[Mapping[str, Any]], attempts: int, seed: int) -> int | None:
+    """Add a line to a policy's log; return how many it has. None: the file cannot be written, and nothing was.
 
     Args:
-        policy: folder of the policy.
+        looks: the log.
+        player: name of the policy among the players.
         groups: what `evaluate` found on each group of sealed levels.
         attempts: at each level.
         seed: of the attempts.
@@ -29,14 +30,14 @@ def log_look(policy: Path, groups: Sequence[Mapping[str, Any]], attempts: int, s
     rates = {
         group["levels"]: {"levels": sampled["levels"], "solved": sampled["once"]["rate"]}
         for group in groups
-        for sampled in [group["of"]["all"]["policy, sampled"]]
+        for sampled in [group["of"]["all"][player]]
     }
     look = {"at": datetime.now(UTC).isoformat(timespec="seconds"), "attempts": attempts, "seed": seed, "on": rates}
     before = b""
     try:
         with suppress(FileNotFoundError):
-            before = read_regular(policy / LOOKS)
-        write(policy / LOOKS, before + json.dumps(look).encode() + b"\n")
+            before = read_regular(looks)
+        write(looks, before + json.dumps(look).encode() + b"\n")
     except OSError:
         return None
     return before.count(b"\n") + 1

@@ -119,6 +119,35 @@ def test_command_refuses(tmp_path: Path, words: list[str], sentence: str) -> Non
     assert_refused(here(["evaluate", *words], tmp_path), 2, sentence)
 
 
+@pytest.mark.slow
+def test_agent_in_a_python_file_plays_as_a_player_does(tmp_path: Path) -> None:
+    (tmp_path / "agent.py").write_text(
+        "import numpy\n\n\ndef act(observation, live, uniform):\n"
+        "    assert observation.shape[1] == 140 and live.shape == uniform.shape\n"
+        "    return (uniform * numpy.array([3, 3, 3, 3, 2, 2])).astype(int)\n"
+    )
+    (group,) = facts(tmp_path, "agent.py", "--levels", "32", *ONCE)["levels"]
+    for players in group["of"].values():
+        assert players["agent"] == players["random"]
+    (look,) = (tmp_path / f"agent.{LOOKS}").read_text().splitlines()
+    assert json.loads(look)["on"]["sealed s"]["solved"] == group["of"]["all"]["random"]["once"]["rate"]
+
+
+@pytest.mark.parametrize(
+    ("source", "sentence"),
+    [
+        ("", "agent.py defines no function act"),
+        ("import nothing_like_this", "agent.py failed: ModuleNotFoundError"),
+        pytest.param("def act(*seen): raise ValueError('no')", "failed: ValueError: no", marks=pytest.mark.slow),
+        pytest.param("def act(*seen): return seen[2]", "returned float32", marks=pytest.mark.slow),
+        pytest.param("def act(*seen): return seen[1] + 7", "returned choices out of range", marks=pytest.mark.slow),
+    ],
+)
+def test_agent_that_cannot_play_is_refused(source: str, sentence: str, tmp_path: Path) -> None:
+    (tmp_path / "agent.py").write_text(source)
+    assert_refused(here(["evaluate", "agent.py", "--levels", "1", *ONCE], tmp_path), 2, sentence)
+
+
 def test_command_refuses_a_policy_of_another_size(tmp_path: Path) -> None:
     policy = policy_in(tmp_path, PolicyKind.FLAT, "m")
     assert_refused(here(["evaluate", str(policy), "--levels", "8"], tmp_path), 2, "plays levels of size m only")

@@ -1,0 +1,76 @@
+"""Agents of any library, in Python files that users name."""
+
+import runpy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from levelproof.experts.evaluation import Moment
+from levelproof.levelgen.task.actions import CHOICES, action_mask
+from levelproof.levelgen.task.observe.flat import symbolic_flat
+from levelproof.pipeline.errors import UserError
+
+ACT = "act"  # the function that a file must define
+SUFFIX = ".py"
+
+
+class Agent:
+    """A player that calls a function of NumPy arrays, on the host, for all lanes at once.
+
+    The function is called as act(observation, live, uniform): symbolic-flat observations, float32
+    [lane, feature]; which entries of the action have an effect, bool [lane, 6]; and random numbers in [0, 1), float32
+    [lane, 6], from which an agent draws if its results are to be the same every time. It returns integers [lane, 6].
+    """
+
+    def __init__(self, name: str, act: Callable[..., Any]) -> None:
+        self.name, self._act = name, act
+        self.error: str | None = None  # what went wrong first; from then on the agent does nothing
+
+    def __call__(self, params: Any, moment: Moment) -> Int[Array, "6 lane"]:
+        observation = symbolic_flat(moment.level, moment.now.state)
+        shape = jax.ShapeDtypeStruct(moment.previous.shape, jnp.int32)
+        live = jnp.broadcast_to(action_mask(moment.level), shape.shape)
+        return jax.pure_callback(self._actions, shape, observation, live, moment.uniform)
+
+    def _actions(self, *lanes_last: Any) -> np.ndarray:
+        observation, live, uniform = (np.asarray(x).T for x in lanes_last)
+        nothing = np.zeros(uniform.shape[::-1], np.int32)
+        if self.error is not None:
+            return nothing
+        try:
+            action = np.asarray(self._act(observation, live, uniform))
+        except Exception as error:
+            self.error = f"{ACT} of {self.name} failed: {type(error).__name__}: {error}"
+            return nothing
+        if action.shape != uniform.shape or not np.issubdtype(action.dtype, np.integer):
+            self.error = (
+                f"{ACT} of {self.name} returned {action.dtype} {list(action.shape)}: it must return integers "
+                f"{list(uniform.shape)}, the choice of each entry"
+            )
+            return nothing
+        if ((action < 0) | (action >= np.array(CHOICES))).any():
+            self.error = f"{ACT} of {self.name} returned choices out of range: the entries have {list(CHOICES)} choices"
+            return nothing
+        return action.astype(np.int32).T
+
+
+def agent_in(file: Path) -> Agent:
+    """Run a Python file, and return the agent whose function `act` it defines.
+
+    Raises:
+        UserError: there is no such file, it fails, or it has no such function.
+    """
+    if not file.is_file():
+        raise UserError(f"There is no agent at {file}: name a Python file that defines {ACT}.")
+    try:
+        act = runpy.run_path(str(file)).get(ACT)
+    except Exception as error:
+        raise UserError(f"{file} failed: {type(error).__name__}: {error}.") from None
+    if not callable(act):
+        raise UserError(f"{file} defines no function {ACT}: docs/evaluate.md says what it is called with.")
+    return Agent(str(file), act)
