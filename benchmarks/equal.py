@@ -35,6 +35,7 @@ class Way(NamedTuple):
     settings: Sequence[str]  # of `levelproof train`, which has the rest of the core-seconds
     start: str = ""  # policy that training starts from; CLONE: one that is made first
     colour: str = "#777777"
+    own_levels: bool = False  # whether to train on the solved levels that the clone learned from
 
 
 CLONE = "clone"
@@ -44,6 +45,7 @@ WAYS = {
     "from scratch, learnability": Way((*SCRATCH, "levels=learnability"), colour="#56b4e9"),
     "levels, clone, reinforcement": Way(TUNING, CLONE, "#d55e00"),
     "levels, clone, learnability": Way((*TUNING, "levels=learnability"), CLONE, "#e69f00"),
+    "levels, clone, reinforcement on these levels": Way(TUNING, CLONE, "#cc79a7", own_levels=True),
     "from builtin:s": Way(TUNING, "builtin:s", "#009e73"),
 }
 
@@ -53,6 +55,7 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--core-seconds", type=float, default=3600, help="of each policy (default: 3600)")
     parser.add_argument("--levels", default="8k", help="levels to search for a clone (default: 8k)")
     parser.add_argument("--updates", type=int, default=1500, help="updates of a clone (default: 1500)")
+    parser.add_argument("--cloning", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of a clone")
 
 
 def run(args: argparse.Namespace) -> Report:
@@ -70,12 +73,12 @@ def run(args: argparse.Namespace) -> Report:
         [
             f"Every policy has {args.core_seconds:,.0f} core-seconds of one core, with compiling, for all that it is "
             f"made from: the search of {args.levels} levels (`procedure=label`, ids from {FIRST:,} on), the clone "
-            f"({args.updates:,} updates), and reinforcement on random levels for the rest; those of builtin:s do not "
+            f"({', '.join((f'{args.updates:,} updates', *(f'`{each}`' for each in args.cloning)))}), and "
+            "reinforcement for the rest, on random levels unless a way says otherwise; those of builtin:s do not "
             "count. *Of all*: "
             f"{players[ALL]['random']['levels']:,} levels, of which some cannot be solved; *of solved*, and the best "
             f"of 8 attempts at them: the {players[SOLVED]['random']['levels']:,} that are labelled solved.",
-            *(f"{way}: `levelproof train size={args.size} cores=1 {' '.join((*WAYS[way].settings, *args.set))}`."
-              for way in args.ways),
+            *(f"{way}: `levelproof train {shown(settings_of(args, way, 0))}`." for way in args.ways),
             f"![Share of episodes that reach the goal in training, against core-seconds]({PLOT})",
             "In the plot, each episode is in a random level never played before, and the weights are those that act; "
             "the table measures their average, which is what is saved.",
@@ -104,15 +107,31 @@ def measuring(args: argparse.Namespace) -> Sequence[Any]:
 
 def cloned(args: argparse.Namespace, seed: int) -> tuple[Path, float]:
     """Search levels, and clone what solves them; return the policy, and the core-seconds of both."""
-    data, policy = args.folder / f"data-{args.size}-{seed}", args.folder / f"clone-{args.size}-{seed}"
-    job = f"levels={args.levels}", f"size={args.size}", f"first_level={FIRST + 10_000_000 * seed}", f"out={data}"
-    command("generate", *job, "procedure=label", "budget=16k", "executor=inline")
-    split = data / "16k" / args.size
+    split, policy = split_of(args, seed), args.folder / f"clone-{args.size}-{seed}"
+    job = f"levels={args.levels}", f"size={args.size}", f"first_level={FIRST + 10_000_000 * seed}"
+    command("generate", *job, f"out={split.parents[1]}", "procedure=label", "budget=16k", "executor=inline")
     ledger = require_manifest(split, ["seconds"]).table["seconds"].to_pylist()
-    words = "network.width=64", f"train.updates={args.updates}", f"seed={seed}"
+    words = "network.width=64", f"train.updates={args.updates}", f"seed={seed}", *args.cloning
     command("clone", split, "-o", policy, *words)
     cloning = lines_of(policy)[-1]["bc/core_seconds"]
     return policy, sum(sum(row.values()) for row in ledger) + cloning
+
+
+def settings_of(args: argparse.Namespace, way: str, seed: int) -> Sequence[str]:
+    """Return the settings of `levelproof train` that say what is trained on, and how."""
+    own = f"levels={split_of(args, seed)}", "where=label = 'solved'"
+    levels = own if WAYS[way].own_levels else (f"size={args.size}",)
+    return *levels, "cores=1", *WAYS[way].settings, *args.set
+
+
+def shown(words: Sequence[str]) -> str:
+    """Return words as a shell takes them."""
+    return " ".join(f'"{word}"' if " " in word else word for word in words)
+
+
+def split_of(args: argparse.Namespace, seed: int) -> Path:
+    """Return where the levels of a clone are."""
+    return args.folder / f"data-{args.size}-{seed}" / "16k" / args.size
 
 
 def trained(
@@ -122,7 +141,7 @@ def trained(
 
     Each command trains up to a number of env steps that the rate so far suggests.
     """
-    words = [f"size={args.size}", f"seed={seed}", "cores=1", "interval=5", *WAYS[way].settings, *args.set]
+    words = [*settings_of(args, way, seed), f"seed={seed}", "interval=5"]
     if start:
         words.append(f"start={start}")
     curve = lines_of(policy)
