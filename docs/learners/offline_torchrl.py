@@ -112,7 +112,7 @@ def act(observation: np.ndarray, live: np.ndarray, uniform: np.ndarray) -> np.nd
         network.load_state_dict(saved["weights"])
         LOADED.update(network=network, method=saved["method"])
     with torch.no_grad():
-        logits = LOADED["network"](torch.from_numpy(np.ascontiguousarray(observation))).numpy()
+        logits = LOADED["network"](torch.from_numpy(observation)).numpy()
     logits = np.where((live[:, None] | (EACH == 0)).all(-1), logits, -np.inf)  # entries without effect stay at 0
     if LOADED["method"] == "cql":
         return EACH[logits.argmax(-1)]

@@ -1,6 +1,7 @@
 """Agents of any library, in Python files that users name."""
 
 import runpy
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,7 @@ class Agent:
         return jax.pure_callback(self._actions, shape, observation, live, moment.uniform)
 
     def _actions(self, *lanes_last: Any) -> np.ndarray:
-        observation, live, uniform = (np.asarray(x).T for x in lanes_last)
+        observation, live, uniform = (np.array(np.asarray(x).T, order="C") for x in lanes_last)  # which it may change
         nothing = np.zeros(uniform.shape[::-1], np.int32)
         if self.error is not None:
             return nothing
@@ -60,16 +61,17 @@ class Agent:
 
 
 def agent_in(file: Path) -> Agent:
-    """Run a Python file, and return the agent whose function `act` it defines.
+    """Run a Python file, which may import its neighbours, and return the agent whose function `act` it defines.
 
     Raises:
         UserError: there is no such file, it fails, or it has no such function.
     """
     if not file.is_file():
         raise UserError(f"There is no agent at {file}: name a Python file that defines {ACT}.")
+    sys.path.insert(0, str(file.parent.absolute()))  # as `python FILE` does
     try:
         act = runpy.run_path(str(file)).get(ACT)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise UserError(f"{file} failed: {type(error).__name__}: {error}.") from None
     if not callable(act):
         raise UserError(f"{file} defines no function {ACT}: docs/evaluate.md says what it is called with.")

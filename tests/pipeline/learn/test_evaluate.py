@@ -122,10 +122,11 @@ def test_command_refuses(tmp_path: Path, words: list[str], sentence: str) -> Non
 @pytest.mark.slow
 def test_agent_in_a_python_file_plays_as_a_player_does(tmp_path: Path) -> None:
     (tmp_path / "agent.py").write_text(
-        "import numpy\n\n\ndef act(observation, live, uniform):\n"
+        "import neighbour, numpy\n\n\ndef act(observation, live, uniform):\n"
         "    assert observation.shape[1] == 140 and live.shape == uniform.shape\n"
         "    return (uniform * numpy.array([3, 3, 3, 3, 2, 2])).astype(int)\n"
     )
+    (tmp_path / "neighbour.py").touch()
     (group,) = facts(tmp_path, "agent.py", "--levels", "32", *ONCE)["levels"]
     for players in group["of"].values():
         assert players["agent"] == players["random"]
