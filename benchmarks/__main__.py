@@ -23,6 +23,8 @@ BENCHMARKS = {  # name: (module, what it measures)
     "search": ("benchmarks.search", "how many more levels a longer search would solve"),
     "equal": ("benchmarks.equal", "learners at equal cost: what a core-hour gives, with and without data"),
     "teaching": ("benchmarks.teaching", "which data teaches best: clones of several procedures' witnesses"),
+    "offline": ("benchmarks.offline", "offline reinforcement learning by TorchRL beside clones of the same levels"),
+    "tuned": ("benchmarks.tuned", "what training on the handmade levels adds, and what it takes from scratch"),
     "late": ("benchmarks.late", "which levels only a long search solves, and how"),
     "prior": ("benchmarks.prior", "what attempts of a policy before the search would find and save"),
     "training": ("benchmarks.training", "env steps/s of rollout, update, and the program that does both"),
