@@ -29,21 +29,29 @@ class Unpickler:
     __init__ = fail
 
 
-@pytest.mark.campaign
-def test_readers_never_unpickle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    split = played_split(tmp_path)
-    theirs = tmp_path / "experts.npz"
-    np.savez(theirs, level_id=np.array([{}], object), curve=np.zeros((1, 1)))
-    for module in (pickle, _pickle):
-        monkeypatch.setattr(module, "load", fail)
-        monkeypatch.setattr(module, "loads", fail)
-        monkeypatch.setattr(module, "Unpickler", Unpickler)
+def read_sealed(split: Path) -> None:
+    """Reads and verifies a split at every density."""
     for density in (None, "resume", "witness"):
         if density:
             seal_split(split, None, Console(quiet=True), density)
         data = levelproof.open(str(split))
         assert next(data.batches(2, seed=0)).observation is not None
         assert examine(split).levels == 64
+
+
+@pytest.mark.campaign
+def test_readers_never_unpickle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Compiled programs are pickled in the user's own cache. Reading another split first loads all
+    # of them, so that what is unpickled afterwards can only come from the data.
+    read_sealed(played_split(tmp_path / "first"))
+    split = played_split(tmp_path / "second")
+    theirs = tmp_path / "experts.npz"
+    np.savez(theirs, level_id=np.array([{}], object), curve=np.zeros((1, 1)))
+    for module in (pickle, _pickle):
+        monkeypatch.setattr(module, "load", fail)
+        monkeypatch.setattr(module, "loads", fail)
+        monkeypatch.setattr(module, "Unpickler", Unpickler)
+    read_sealed(split)
     assert read_note(split).intact
     with pytest.raises(Failure, match="cannot be read"):
         load_experts(theirs, made_job())
