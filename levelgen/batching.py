@@ -33,9 +33,11 @@ def at_once(lanes: int, in_cache: int) -> int:
     return max(1, (in_cache if jax.default_backend() == "cpu" else LANES_ON_ACCELERATOR) // lanes)
 
 
-def take(tree: T, lanes: np.ndarray) -> T:
-    """Select the lanes with these indices from every array."""
-    return jax.tree.map(lambda x: x[..., lanes], tree)
+def take(tree: T, lanes: np.ndarray | slice) -> T:
+    """Select these lanes from every array; in slices, numpy arrays are views."""
+    if isinstance(lanes, slice):
+        return jax.tree.map(lambda x: x[..., lanes], tree)
+    return jax.tree.map(lambda x: x.take(lanes, -1), tree)  # of numpy arrays three times as fast as an index
 
 
 def repeat(tree: T, lanes: int) -> T:

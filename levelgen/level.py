@@ -72,8 +72,7 @@ class Level:
             IndexError: there is no such level.
         """
         chosen = np.atleast_1d(np.arange(len(self))[index])
-        expand = lambda x: np.broadcast_to(x, (*x.shape[:-1], len(self)))  # in numpy: JAX would compile each shape
-        return jax.tree.map(lambda x: expand(np.asarray(x))[..., chosen], self)
+        return jax.tree.map(lambda x: x[..., chosen], _expanded(self))
 
 
 def concatenate_levels(parts: Sequence[Level]) -> Level:
@@ -86,7 +85,14 @@ def concatenate_levels(parts: Sequence[Level]) -> Level:
     if len(sizes) != 1:
         names = ", ".join(map(name_of, sizes))
         raise ValueError(f"levels of the sizes {names} cannot be joined" if sizes else "there are no levels to join")
-    return jax.tree.map(lambda *lanes: np.concatenate(lanes, -1), *(part[:] for part in parts))
+    return jax.tree.map(lambda *lanes: np.concatenate(lanes, -1), *map(_expanded, parts))
+
+
+def _expanded(level: Level) -> Level:
+    """Return numpy views of all arrays with as many lanes as the level has."""
+    lanes = len(level)
+    expand = lambda x: np.broadcast_to(x, (*x.shape[:-1], lanes))  # in numpy: JAX would compile each shape
+    return jax.tree.map(lambda x: expand(np.asarray(x)), level)
 
 
 def size_of(name: str | Size) -> Size:

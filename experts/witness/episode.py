@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.witness.resume import checksum, paths_of
@@ -19,14 +19,14 @@ from levelproof.levelgen.batching import blocks, take
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import controls
-from levelproof.levelgen.task.observe.kinds import ObservationType, constant_features, observe
+from levelproof.levelgen.task.observe.kinds import ObservationType, changing_features, constant_features, join
 from levelproof.levelgen.task.rules import TaskParams, TaskState
 from levelproof.physics.buffers import zeros_of
 from levelproof.physics.types import Manifold
 
 # Lanes of a block, which ends with its longest episode: with more, lanes of few episodes would wait for the last one;
 # with fewer, a step of the engine would cost more per lane.
-FEW_LANES, MANY_LANES = 16, 64
+FEW_LANES, MANY_LANES = 16, 128
 MANY = 512  # episodes from which on blocks have MANY_LANES, because neighbours in length differ little
 LENGTHS = (64, RECORD_STEPS)  # env steps that a block has room for: one program for each
 
@@ -43,7 +43,8 @@ class PlayedEpisodes(NamedTuple):
 class _PlayedBlock(NamedTuple):
     """Episodes of a block; what lies after the last step of an episode has no meaning."""
 
-    rows: tuple[dict[str, Array], Any]  # fields by path and the observation, [step, lane, ...]
+    rows: tuple[dict[str, Array], Any]  # fields by path, and what the observation has of the state, [step, lane, ...]
+    constant: Float[Array, "lane feature"]  # what the observation has of the level
     checksum: UInt32[Array, " lane"]
     reaches: Bool[Array, " lane"]
 
@@ -75,24 +76,38 @@ def play_episodes(
         fields: paths of `Record` to return; anything else is not kept.
         observation: type of the observation to return; None: none.
     """
-    count, first = len(steps), np.cumsum(steps) - steps
-    by_length = np.argsort(steps, kind="stable")
+    count, first, total = len(steps), np.cumsum(steps) - steps, int(steps.sum())
+    size = MANY_LANES if count >= MANY else FEW_LANES
+    order = np.argsort(steps, kind="stable")[np.concatenate([*blocks(count, size)])]
+    ordered = take((level, steps.astype(np.int32)), order)
     sums, reaches = np.zeros(count, np.uint32), np.zeros(count, bool)
     rows: Any = None
-    for lanes in blocks(count, MANY_LANES if count >= MANY else FEW_LANES):
-        mine = by_length[lanes]
+    for start in range(0, len(order), size):
+        mine = order[start : start + size]
         room = next(length for length in LENGTHS if length >= steps[mine[-1]])
-        given = take((level, action[:room], steps.astype(np.int32)), mine)
-        made: _PlayedBlock = jax.device_get(_play_block(*given, rules, fields, observation))
+        its_level, its_steps = take(ordered, slice(start, start + size))
+        its_action = take(action[:room], mine)
+        made: _PlayedBlock = jax.device_get(_play_block(its_level, its_action, its_steps, rules, fields, observation))
         sums[mine], reaches[mine] = made.checksum, made.reaches
         if rows is None:
-            rows = jax.tree.map(lambda x: np.empty((int(steps.sum()), *x.shape[2:]), x.dtype), made.rows)
-        pairs = [*zip(jax.tree.leaves(rows), jax.tree.leaves(made.rows), strict=True)]
-        for lane, i in enumerate(mine[: lanes[-1] - lanes[0] + 1].tolist()):  # without padding
-            for to, source in pairs:
-                to[first[i] : first[i] + steps[i]] = source[: steps[i], lane]
+            rows = jax.tree.map(lambda x: np.empty((total, *x.shape[2:]), x.dtype), made.rows)
+            constant = np.empty((count, made.constant.shape[1]), np.float32)
+        constant[mine] = made.constant
+        mine = mine[: count - start]  # without padding
+        lane, step = _each_step(steps[mine])
+        row, place = first[mine][lane] + step, step * size + lane
+        for to, source in zip(jax.tree.leaves(rows), jax.tree.leaves(made.rows), strict=True):
+            to[row] = source.reshape(-1, *source.shape[2:]).take(place, 0)
     made_fields, shown = rows
+    if observation is not None:
+        shown = join(observation, level.size, constant, shown, _each_step(steps)[0])
     return PlayedEpisodes(made_fields, shown, sums, reaches)
+
+
+def _each_step(steps: Int[np.ndarray, " level"]) -> tuple[Int[np.ndarray, " row"], Int[np.ndarray, " row"]]:
+    """Return the episode and the step of each row of episodes of these lengths, one episode after another."""
+    episode = np.repeat(np.arange(len(steps)), steps)
+    return episode, np.arange(len(episode)) - (np.cumsum(steps) - steps)[episode]
 
 
 @partial(jax.jit, static_argnames=("rules", "fields", "observation"))
@@ -105,12 +120,11 @@ def _play_block(
     observation: ObservationType | None,
 ) -> _PlayedBlock:
     with_contacts = any(name.startswith("manifold/") for name in fields)
-    constant = constant_features(observation, level)
 
     def row(now: TaskState, manifold: Any, taken: Array, outcome: Any) -> Any:
         made = paths_of(record_of(level, now, manifold, taken, outcome))
         kept = {name: x for name, x in made.items() if name in fields}
-        shown = None if observation is None else observe(observation, level, now.state, constant)
+        shown = None if observation is None else changing_features(observation, level, now.state)
         return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), (kept, shown))
 
     def act(playing: _PlayingBlock) -> _PlayingBlock:
@@ -131,7 +145,8 @@ def _play_block(
     empty = jax.tree.map(lambda x: jnp.zeros((len(action), *x.shape), x.dtype), shapes)
     begun = _PlayingBlock(jnp.int32(0), start, contacts, start, jnp.ones(len(steps), bool), empty)
     over = jax.lax.while_loop(lambda playing: playing.step < steps.max(), act, begun)
-    return _PlayedBlock(over.rows, _checksum(start, over.end, steps), over.reaches)
+    sums, constant = _checksum(start, over.end, steps), constant_features(observation, level)
+    return _PlayedBlock(over.rows, constant.T, sums, over.reaches)
 
 
 def _checksum(start: TaskState, end: TaskState, steps: Any) -> Any:

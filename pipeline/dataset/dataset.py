@@ -271,7 +271,7 @@ class Dataset:
         order = EpochOrder(len(indices), batch_size, seed, process_index, process_count)
 
         def load(positions: range) -> list[EpisodeBatch]:
-            items, new = map(np.concatenate, zip(*map(order.items, positions), strict=True))
+            items, new = order.items(positions)
             read = self.episodes(indices[items], fields, observation)
             return replace(read, mask=new[read.episode]).parts(batch_size)
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Int
 
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.task.observe.kinds import ObservationType, constant_features
+from levelproof.levelgen.task.observe.kinds import ObservationType, changing_features, constant_features, join
 from levelproof.levelgen.task.observe.kinds import observe as observe_lanes
 from levelproof.physics.types import State
 from levelproof.pipeline.errors import UserError
@@ -41,8 +41,9 @@ def observe_rows(kind: ObservationType, level: Level, row_level: Int[np.ndarray,
     padded = max(MIN_ROWS, 1 << (count - 1).bit_length())
     row_level, states = jax.tree.map(lambda x: np.resize(x, (padded, *x.shape[1:])), (row_level, states))
     with COMPILING:
-        shown = jax.device_get(_observe_rows(kind, level, row_level, states))
-    return jax.tree.map(lambda x: x[:count], shown)
+        constant, changing = jax.device_get(_observe_rows(kind, level, row_level, states))
+    changing = jax.tree.map(lambda x: x[:count], changing)
+    return join(kind, jax.eval_shape(_lanes_last, level).size, constant, changing, row_level[:count])
 
 
 @partial(jax.jit, static_argnames="kind")
@@ -55,10 +56,8 @@ def _observe(kind: ObservationType, level: Level, states: State) -> Any:
 @partial(jax.jit, static_argnames="kind")
 def _observe_rows(kind: ObservationType, level: Level, row_level: Any, states: State) -> Any:
     level, states = _lanes_last((level, states))
-    own = lambda x: x[..., row_level]
-    constant = own(constant_features(kind, level))
-    shown = observe_lanes(kind, jax.tree.map(own, level), states, constant)
-    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), shown)
+    changing = changing_features(kind, jax.tree.map(lambda x: x[..., row_level], level), states)
+    return constant_features(kind, level).T, jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), changing)
 
 
 def _lanes_last(tree: T) -> T:

@@ -41,21 +41,22 @@ class EpochOrder:
         """Number of batches per epoch, equal on every host."""
         return -(-self.count // (self.batch_size * self.process_count))
 
-    def items(self, position: int) -> tuple[Int[np.ndarray, " batch"], Bool[np.ndarray, " batch"]]:
-        """Return the items of a batch, and which of them are not padding.
+    def items(self, positions: int | range) -> tuple[Int[np.ndarray, " item"], Bool[np.ndarray, " item"]]:
+        """Return the items of batches, one batch after another, and which of them are not padding.
 
         Every item occurs once per epoch; repeated items pad the last batch on every host.
 
         Args:
-            position: index of the batch, counted from the start of the first epoch.
+            positions: indices of the batches, counted from the start of the first epoch; or of one batch.
         """
-        epoch, step = divmod(position, self.batches)
-        first = (step * self.process_count + self.process_index) * self.batch_size
-        ranks = np.arange(first, first + self.batch_size)
+        epochs, steps = np.divmod(np.atleast_1d(positions), self.batches)
+        first = (steps * self.process_count + self.process_index) * self.batch_size
+        ranks = first[:, None] + np.arange(self.batch_size)
         items = ranks % self.count
         if self.seed is not None:
-            items = permute(items, self.count, self.seed, epoch)
-        return items, ranks < self.count
+            for epoch in np.unique(epochs).tolist():
+                items[epochs == epoch] = permute(items[epochs == epoch], self.count, self.seed, epoch)
+        return items.ravel(), ranks.ravel() < self.count
 
 
 def permute(positions: Int[np.ndarray, "*n"], count: int, seed: int, epoch: int = 0) -> Int[np.ndarray, "*n"]:

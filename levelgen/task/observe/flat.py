@@ -22,6 +22,7 @@ GRAVITY_UNIT = 10.0  # m/s^2
 SPIN_UNIT = 10.0  # rad/s; angular velocity w is observed as tanh(w / SPIN_UNIT)
 NO_VERTEX = -1.0  # coordinates of a triangle's fourth vertex
 UNSEEN_WALLS = range(1, FIXED_POLYGONS)  # left wall, right wall, ceiling
+AT_ONCE = 512  # observations that `join_features` writes at once, so that they stay in the processor's cache
 
 # Rows of a body: position 0-1, velocity 2-3, inverse mass 4, inverse inertia 5, density 6, spin 7, role 8-11,
 # sine 12 and cosine 13 of the rotation, friction 14, restitution 15, then its shape.
@@ -75,6 +76,31 @@ def symbolic_flat(
         pieces.append(moving[used : used + stop - start] if is_dynamic else constant[start:stop])
         used += (stop - start) * is_dynamic
     return jnp.concatenate(pieces)
+
+
+def join_features(
+    size: Size,
+    constant: Float[np.ndarray, "level feature"],
+    moving: Float[np.ndarray, "row dynamic"],
+    row_level: Int[np.ndarray, " row"],
+) -> Float[np.ndarray, "row feature"]:
+    """Join `level_features` and `state_features`, both with features last, into observations.
+
+    Outside of XLA, because copying a level's features to each of its rows takes a third of the time that XLA takes to
+    concatenate the pieces of `symbolic_flat`, feature by feature.
+
+    Args:
+        size: of the levels.
+        constant: features of the levels.
+        moving: features of the states.
+        row_level: the level of each state.
+    """
+    rows, dynamic = np.empty((len(moving), constant.shape[1]), np.float32), dynamic_features(size)
+    for first in range(0, len(rows), AT_ONCE):
+        some = slice(first, first + AT_ONCE)
+        np.take(constant, row_level[some], 0, rows[some], mode="clip")  # mode "raise" would copy the result once more
+        rows[some, dynamic] = moving[some]
+    return rows
 
 
 @cache

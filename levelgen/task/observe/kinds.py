@@ -6,13 +6,19 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.observe.entities import entities, symbolic_padded
-from levelproof.levelgen.task.observe.flat import level_features, symbolic_flat
+from levelproof.levelgen.task.observe.flat import (
+    join_features,
+    level_features,
+    state_features,
+    symbolic_flat,
+)
 from levelproof.levelgen.task.observe.pixels import pixels
-from levelproof.physics.types import State
+from levelproof.physics.types import Size, State
 
 
 class ObservationType(StrEnum):
@@ -36,6 +42,34 @@ def constant_features(kind: ObservationType | None, level: Level) -> Float[Array
     if kind == ObservationType.SYMBOLIC_FLAT:
         return level_features(level)
     return jnp.zeros((0, len(level)))
+
+
+def changing_features(kind: ObservationType, level: Level, state: State) -> Any:
+    """Observe what can change within a level, lanes last; for kinds without constant features, everything."""
+    if kind == ObservationType.SYMBOLIC_FLAT:
+        return state_features(level, state)
+    return OF_LEVEL_AND_STATE[kind](replace(level, state=state), state)
+
+
+def join(
+    kind: ObservationType,
+    size: Size,
+    constant: Float[np.ndarray, "level feature"],
+    changing: Any,
+    row_level: Int[np.ndarray, " row"],
+) -> Any:
+    """Join what is constant and what changes into whole observations, numpy arrays [row, ...].
+
+    Args:
+        kind: type of the observation.
+        size: of the levels.
+        constant: `constant_features` of the levels.
+        changing: `changing_features` of the states, [row, ...].
+        row_level: the level of each state.
+    """
+    if kind == ObservationType.SYMBOLIC_FLAT:
+        return join_features(size, constant, changing, row_level)
+    return changing
 
 
 def observe(

@@ -12,7 +12,7 @@ from jaxtyping import Int
 from levelproof.configs.convert import typed
 from levelproof.configs.errors import ConfigError
 from levelproof.configs.schema import MAX_FRAME_SKIP, from_files
-from levelproof.levelgen.batching import block_size, blocks
+from levelproof.levelgen.batching import block_size, blocks, take
 from levelproof.levelgen.identity.keys import SAMPLER_VERSION
 from levelproof.levelgen.level import Level, concatenate_levels, size_of
 from levelproof.levelgen.sampling.distribution import Distribution
@@ -79,4 +79,4 @@ class LevelSource:
         parts = [
             jax.device_get(sample_chunk(ids[some], self.size, self.distribution)) for some in blocks(len(ids), lanes)
         ]
-        return concatenate_levels(parts)[: len(ids)]
+        return take(concatenate_levels(parts), slice(len(ids)))

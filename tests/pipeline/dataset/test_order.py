@@ -61,6 +61,14 @@ def test_epoch_order_without_a_seed_keeps_item_order() -> None:
     assert EpochOrder(10, 4, None).items(1)[0].tolist() == [4, 5, 6, 7]
 
 
+def test_items_of_several_batches_are_those_of_each() -> None:
+    order, positions = EpochOrder(10, 4, 0), range(1, 8)  # the first epoch has three batches
+    items, new = order.items(positions)
+    each = [order.items(position) for position in positions]
+    assert items.tolist() == np.concatenate([one for one, _ in each]).tolist()
+    assert new.tolist() == np.concatenate([one for _, one in each]).tolist()
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
