@@ -82,6 +82,7 @@ def play_episodes(
     ordered = take((level, steps.astype(np.int32)), order)
     sums, reaches = np.zeros(count, np.uint32), np.zeros(count, bool)
     rows: Any = None
+    constants: list[np.ndarray] = []
     for start in range(0, len(order), size):
         mine = order[start : start + size]
         room = next(length for length in LENGTHS if length >= steps[mine[-1]])
@@ -91,8 +92,7 @@ def play_episodes(
         sums[mine], reaches[mine] = made.checksum, made.reaches
         if rows is None:
             rows = jax.tree.map(lambda x: np.empty((total, *x.shape[2:]), x.dtype), made.rows)
-            constant = np.empty((count, made.constant.shape[1]), np.float32)
-        constant[mine] = made.constant
+        constants.append(np.asarray(made.constant))
         mine = mine[: count - start]  # without padding
         lane, step = _each_step(steps[mine])
         row, place = first[mine][lane] + step, step * size + lane
@@ -100,6 +100,7 @@ def play_episodes(
             to[row] = source.reshape(-1, *source.shape[2:]).take(place, 0)
     made_fields, shown = rows
     if observation is not None:
+        constant = np.concatenate(constants)[np.argsort(order[:count])]  # in the given order
         shown = join(observation, level.size, constant, shown, _each_step(steps)[0])
     return PlayedEpisodes(made_fields, shown, sums, reaches)
 
