@@ -8,7 +8,7 @@ EXAMPLE = """\
 levelproof train size=s -o agent/
 levelproof train size=m start=policy/ levels=learnability ppo.env_steps=100M -o tuned/
 levelproof train levels=data/128k/s start=policy/ -o tuned/"""
-HELP = "settings to change as NAME=VALUE; docs/finetune.md lists them"
+HELP = "settings to change as NAME=VALUE; docs/finetune.md and docs/curricula.md list them"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

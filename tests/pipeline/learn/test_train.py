@@ -255,8 +255,8 @@ def test_folder_with_the_note_of_another_command_is_refused(note: Any, tmp_path:
     assert_refused(here(["train", *LANES, *TINY], tmp_path), 2, "has a run with other settings or levels")
 
 
-def test_guide_lists_every_setting_with_its_default_and_meaning() -> None:
-    guide = (ROOT / "docs/finetune.md").read_text()
+def test_guides_list_every_setting_with_its_default_and_meaning() -> None:
+    guide = "".join((ROOT / f"docs/{page}.md").read_text() for page in ("finetune", "curricula"))
     groups = {"": TrainConfig, "ppo.": PPOConfig, "curriculum.": CurriculumConfig}
     for path, cls in (groups | {"replay.": ReplayConfig, "evolve.": EvolveConfig}).items():
         for name, comment in comments_in(cls).items():
