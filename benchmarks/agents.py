@@ -41,8 +41,13 @@ def run(args: argparse.Namespace) -> Report:
         "one: the protocol of the reference (kinetix-env 3.0.2), whose README has the rates of `sfl-paper` and "
         "`sfl-1m-envs`. The reference wrote the levels; ours are played in our engine. Unsolvable levels count, too. "
         "Brackets: 95% intervals over levels; the published rates have none.",
-        "Env steps are those of reinforcement, with the levels. `builtin:s` also learned from demonstrations, whose "
-        "env steps are not counted: witnesses of 24,389 levels of s.",
+        "Env steps are those of reinforcement, with the levels.",
+        *(
+            f"`{policy}` also learned from demonstrations, whose env steps are not counted: witnesses of {count:,} "
+            "levels."
+            for policy in args.policies
+            if (count := demonstrated(policy))
+        ),
     ]
     return Report("Policies beside published agents", results, tables, notes)
 
@@ -59,6 +64,12 @@ def evaluated(args: argparse.Namespace, policy: str, on: str, size: str) -> dict
     steps = f"{origin['env_steps']:,}, {origin['levels']['levels']}" if "env_steps" in origin else "none"
     facts = {"policy": policy, "on": on, "size": size, "env_steps": steps}
     return facts | {"rates": group["of"][ALL], "published": group["published"], "levels": levels_of(group)}
+
+
+def demonstrated(policy: str) -> int:
+    """Return how many levels' witnesses a policy, or the one that its training started from, was cloned from."""
+    origin = load_policy(policy).origin
+    return sum(split["levels"] for split in origin.get("start_origin", origin).get("splits", []))
 
 
 def levels_of(group: dict[str, Any]) -> int:
