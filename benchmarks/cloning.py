@@ -6,8 +6,10 @@ resumes from its checkpoint, and the folder keeps finished evaluations.
 
 import argparse
 import json
+import os
 import subprocess
 import sys
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -108,12 +110,22 @@ def kept(file: Path, *words: Any) -> dict[str, Any]:
 
 def command(*words: Any) -> str:
     """Run a command; return its output. Raise Failure with the last line of its errors if it fails."""
-    done = subprocess.run(
-        [sys.executable, "-m", "levelproof", *map(str, words)], capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        raise Failure(f"levelproof {words[0]} failed: {done.stderr.strip().splitlines()[-1]}")
-    return done.stdout
+    return timed_command(*words)[0]
+
+
+def timed_command(*words: Any) -> tuple[str, float]:
+    """Run a command as `command` does; return its output, and the CPU seconds of its process."""
+    with tempfile.TemporaryFile("w+") as output, tempfile.TemporaryFile("w+") as errors:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "levelproof", *map(str, words)], stdout=output, stderr=errors, text=True
+        )
+        _, status, used = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        for file in (output, errors):
+            file.seek(0)
+        if process.returncode:
+            raise Failure(f"levelproof {words[0]} failed: {errors.read().strip().splitlines()[-1]}")
+        return output.read(), used.ru_utime + used.ru_stime
 
 
 def row_of(count: int, results: list[dict[str, Any]]) -> list[str]:

@@ -1,10 +1,11 @@
 """Learners at equal cost: reinforcement from scratch, against solved levels, a clone of them, and reinforcement of it.
 
-Everything that a way needs counts as its core-seconds. A stopped run resumes: every command continues what it left,
-training from its checkpoint, and the folder keeps finished evaluations.
+Everything that a way needs counts as its core-seconds. A stopped run resumes, except in a search: every command
+continues what it left, training from its checkpoint, and the folder keeps finished evaluations.
 """
 
 import argparse
+import json
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -12,13 +13,13 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
 
-from benchmarks.cloning import SAMPLED, command, kept
+from benchmarks.cloning import SAMPLED, command, kept, timed_command
 from benchmarks.learners import ATTEMPTS, RATE, SECONDS, STEPS, add_ways, lines_of, rates_text, slug
 from benchmarks.plotting import pyplot
 from benchmarks.report import Report, Table
+from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.learn.evaluate import ALL, SOLVED
 from levelproof.pipeline.runtime import own_cores
-from levelproof.pipeline.store.manifest import require_manifest
 
 FIRST = 50_000  # id of the first level to clone from; the measured ones are sealed
 LARGE = ("ppo.environments=2048", "ppo.epochs=2")  # fewer, larger steps than the defaults'
@@ -59,11 +60,11 @@ def register(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> Report:
-    runs = [(way, seed) for seed in range(args.seeds) for way in args.ways]
+    runs = [(way, seed) for way in args.ways for seed in range(args.seeds)]
     with ThreadPoolExecutor(len(own_cores())) as threads:
         results = [*threads.map(lambda one: measured(args, *one), runs)]
     players = results[0]["sealed"]
-    rows = [row for each in results for row in rows_of(each)]
+    rows = [list(row) for row in dict.fromkeys(tuple(row) for each in results for row in rows_of(each))]
     rows += [row_of(name, ("", "", ""), players, name) for name in PLAYERS if name in players[ALL]]
     head = ("policy", "env steps", "core-seconds before training", "in all", "of all", "of solved", "best of 8")
     return Report(
@@ -94,9 +95,9 @@ def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
     if start == CLONE:
         with CLONING:
             start, before = cloned(args, seed)
-            clone = kept(args.folder / f"clone-{args.size}-{seed}.json", start, *measuring(args))
+            clone = kept(args.folder / f"clone-{args.size}-{seed}-{args.measured}.json", start, *measuring(args))
     curve = trained(args, folder, way, start, seed, args.core_seconds - before)
-    rates = kept(folder.with_suffix(".json"), folder, *measuring(args))
+    rates = kept(args.folder / f"{folder.name}-{curve[-1][STEPS]}-{args.measured}.json", folder, *measuring(args))
     return {"way": way, "seed": seed, "before": before, "curve": curve, "sealed": rates, "clone": clone}
 
 
@@ -107,14 +108,29 @@ def measuring(args: argparse.Namespace) -> Sequence[Any]:
 
 def cloned(args: argparse.Namespace, seed: int) -> tuple[Path, float]:
     """Search levels, and clone what solves them; return the policy, and the core-seconds of both."""
-    split, policy = split_of(args, seed), args.folder / f"clone-{args.size}-{seed}"
-    job = f"levels={args.levels}", f"size={args.size}", f"first_level={FIRST + 10_000_000 * seed}"
-    command("generate", *job, f"out={split.parents[1]}", "procedure=label", "budget=16k", "executor=inline")
-    ledger = require_manifest(split, ["seconds"]).table["seconds"].to_pylist()
+    policy, search = args.folder / f"clone-{args.size}-{seed}", searched(args, seed)
     words = "network.width=64", f"train.updates={args.updates}", f"seed={seed}", *args.cloning
-    command("clone", split, "-o", policy, *words)
-    cloning = lines_of(policy)[-1]["bc/core_seconds"]
-    return policy, sum(sum(row.values()) for row in ledger) + cloning
+    command("clone", split_of(args, seed), "-o", policy, *words)
+    return policy, search + lines_of(policy)[-1]["bc/core_seconds"]
+
+
+def searched(args: argparse.Namespace, seed: int) -> float:
+    """Search levels; return the CPU seconds that it took.
+
+    A split's own ledger has seconds of a clock, which other work on the machine makes longer.
+
+    Raises:
+        Failure: a run that was stopped has left a part of the levels, whose seconds nobody knows.
+    """
+    out = split_of(args, seed).parents[1]
+    file = out.with_suffix(".json")
+    if not file.exists():
+        if out.exists():
+            raise Failure(f"{out} was left by a run that was stopped: remove it, so that its search counts as a whole.")
+        job = f"levels={args.levels}", f"size={args.size}", f"first_level={FIRST + 10_000_000 * seed}"
+        words = *job, f"out={out}", "procedure=label", "budget=16k", "executor=inline"
+        file.write_text(json.dumps({"core_seconds": timed_command("generate", *words)[1]}))
+    return json.loads(file.read_text())["core_seconds"]
 
 
 def settings_of(args: argparse.Namespace, way: str, seed: int) -> Sequence[str]:
@@ -153,13 +169,10 @@ def trained(
         update = last[STEPS] / last["train/updates"]
         # Of a single update, most of the seconds are compiling
         rate = (last[STEPS] - first[STEPS]) / (last[SECONDS] - first[SECONDS]) if len(curve) > 1 else 0.0
-        left = limit - last[SECONDS]
-        if len(curve) == 1:
-            steps = last[STEPS] + update
-        elif left * rate < update:
+        left = limit - last[SECONDS] - first[SECONDS]  # the next command starts anew
+        if left <= 0 or (rate and left * rate < update):
             return curve
-        else:
-            steps = last[STEPS] + left * rate // update * update
+        steps = last[STEPS] + (left * rate // update * update if rate else update)
 
 
 def rows_of(each: Mapping[str, Any]) -> list[list[str]]:

@@ -84,7 +84,8 @@ def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
     steps = f"ppo.env_steps={parse_count(args.env_steps, '--env-steps')}"
     command("train", f"size={args.size}", steps, f"seed={seed}", "cores=1", *WAYS[way], *args.set, "-o", policy)
     curve = [{name: line.get(name) for name in (STEPS, SECONDS, RATE)} for line in lines_of(policy)]
-    return {"way": way, "seed": seed, "curve": curve, "sealed": evaluated(args, policy / "sealed.json", policy)}
+    rates = evaluated(args, policy / f"sealed-{curve[-1][STEPS]}.json", policy)
+    return {"way": way, "seed": seed, "curve": curve, "sealed": rates}
 
 
 def slug(name: str) -> str:

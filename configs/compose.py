@@ -243,6 +243,8 @@ def compose_train(overrides: Sequence[str]) -> "TrainConfig":
             raise ConfigError(f"{name} has no effect with levels={config.levels}: leave it out.")
         if not config.start and name in ("ppo.critic_updates", "ppo.kl_weight", "ppo.kl_updates"):
             raise ConfigError(f"{name} has no effect without start: leave it out.")
+        if name == "ppo.kl_updates" and not config.ppo.kl_weight:
+            raise ConfigError(f"{name} has no effect without ppo.kl_weight: leave it out.")
     _require_no_network(config.start, parsed)
     if random and config.distribution not in distributions():
         hint = suggestion(config.distribution, distributions())

@@ -35,9 +35,9 @@ def at_once(lanes: int, in_cache: int) -> int:
 
 def take(tree: T, lanes: np.ndarray | slice) -> T:
     """Select these lanes from every array; in slices, numpy arrays are views."""
-    if isinstance(lanes, slice):
-        return jax.tree.map(lambda x: x[..., lanes], tree)
-    return jax.tree.map(lambda x: x.take(lanes, -1), tree)  # of numpy arrays three times as fast as an index
+    quick = lambda x: not isinstance(lanes, slice) and isinstance(x, np.ndarray) and x.flags.c_contiguous
+    # `np.take` is three times as fast as an index, but would first copy an array of another layout
+    return jax.tree.map(lambda x: np.take(x, lanes, -1) if quick(x) else x[..., lanes], tree)
 
 
 def repeat(tree: T, lanes: int) -> T:

@@ -163,8 +163,8 @@ def train(
                 numbers["bc/core_seconds"] = before + time.process_time()
                 require_finite(numbers["bc/loss"], "train.learning_rate")
                 recent = []
+                metrics.write(numbers)  # before the checkpoint: a run that continues drops lines after it
                 save(state)
-                metrics.write(numbers)
                 say(console, f"{line_of(update, last, numbers)} · {pace}")
                 aside += time.monotonic() - paused
     return state

@@ -239,8 +239,8 @@ def update_until_done(
                 pace = (time.monotonic() - began) / (until - first - config.interval)
                 words += f" · about {duration((last - until) * pace)} left"
             show(until - update, words)
+            metrics.write(numbers)  # before the checkpoint: a run that continues drops lines after it
             save(now)
-            metrics.write(numbers)
             say(console, words)
     return now
 

@@ -85,9 +85,7 @@ def evaluate(
     for group in _groups(on, where, sizes, count, starts, partial(say, console)):
         if loaded:
             require_size(loaded, group.levels.size, group.name, "choose others with --on or --size")
-        own = sealed_specialists(name_of(group.levels.size), len(group.level_ids), attempts) if on == SEALED else []
-        own += [specialists_of(split, group.level_ids, attempts) for split in experts]
-        facts.append(_measured(group, entrants, own, attempts, seed, console))
+        facts.append(_measured(group, entrants, _own_experts(group, on, experts, attempts), attempts, seed, console))
         if agent and agent.error:
             raise UserError(f"{agent.error}.")
     if policy and on == SEALED:
@@ -152,6 +150,16 @@ def _entrants(policy: Policy | None) -> dict[str, _Entrant]:
         entrants[SAMPLED] = _Entrant(play_sampled(policy.network), policy.params)
         entrants["policy, greedy"] = _Entrant(play_most_probable(policy.network), policy.params, chance=False)
     return entrants
+
+
+def _own_experts(group: MeasuredLevels, on: str, splits: Sequence[Path], attempts: int) -> list[Specialists]:
+    """Return the rated attempts of the levels' own experts; of two with one budget, the second names its split."""
+    own = sealed_specialists(name_of(group.levels.size), len(group.level_ids), attempts) if on == SEALED else []
+    for split in splits:
+        one = specialists_of(split, group.level_ids, attempts)
+        taken = any(one.name == other.name for other in own)
+        own.append(one._replace(name=f"{one.name}, {split}") if taken else one)
+    return own
 
 
 def _measured(

@@ -80,7 +80,7 @@ def continued(out: Path, fresh: T) -> T:
 
 def weights_digest(policy: str) -> str | None:
     """Return the SHA-256 of the weights of the policy that a run starts from; None for an empty name."""
-    return hashlib.sha256(read_regular(policy_folder(policy) / WEIGHTS)).hexdigest() if policy else None
+    return hashlib.sha256((policy_folder(policy) / WEIGHTS).read_bytes()).hexdigest() if policy else None
 
 
 def require_finite(loss: float, setting: str) -> None:

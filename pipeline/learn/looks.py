@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from levelproof.pipeline.store.disk import read_regular
+from levelproof.pipeline.store.disk import NotRegular, read_regular
 from levelproof.pipeline.store.files import write
 
 LOOKS = "looks.jsonl"
@@ -38,6 +38,6 @@ def log_look(looks: Path, player: str, groups: Sequence[Mapping[str, Any]], atte
         with suppress(FileNotFoundError):
             before = read_regular(looks)
         write(looks, before + json.dumps(look).encode() + b"\n")
-    except OSError:
+    except (OSError, NotRegular):
         return None
     return before.count(b"\n") + 1

@@ -103,7 +103,8 @@ def _cut(witnesses: Witnesses, whole: bool) -> LevelPool:
     steps = np.full(count, length) if whole else ends
     kept = np.arange(length) < steps[:, None]
     columns = [x if x.ndim == 4 else x[..., None] for x in motion]
-    rows = np.concatenate(columns, -1).reshape(count, length, -1)
+    rows = np.concatenate(columns, -1)
+    rows = rows.reshape(count, length, rows.shape[-2] * rows.shape[-1])  # of no witnesses, too
     rows = np.concatenate([rows, *contacts], -1, dtype=np.float32)[kept]
     level = jax.tree.map(lambda x: np.moveaxis(x, 0, -1), replace(witnesses.level, state=None))  # pyright: ignore
     return LevelPool(level, np.cumsum(steps) - steps, steps, rows, witnesses.action[kept].astype(np.int8))
@@ -146,7 +147,7 @@ class Feed:
     def _read(self, turn: int) -> list[LevelPool]:
         pools = []
         for source, order in zip(self._sources, self._orders, strict=True):
-            items, _ = order.items(turn)  # an epoch's last round is padded with levels of the next epoch's first round
+            items, _ = order.items(turn)  # an epoch's last round is padded with levels of its first
             whole, mirror = self._config.episodes == "all", self._config.mirror
             pools.append(read_pool(source.data, source.train[items], self._config.network, whole, mirror, self._follow))
         return pools

@@ -117,7 +117,8 @@ def prepared_cores(config: TrainConfig, note: dict[str, Any] | None) -> int:
     Raises:
         UserError: JAX has fewer devices than that.
     """
-    wanted = int(note["cores"]) if note and "cores" in note else config.cores
+    noted = int(note["cores"]) if note and "cores" in note else 0
+    wanted = noted if noted and config.ppo.shares_out(noted) else config.cores  # else it is another run's folder
     even = next((cores for cores in range(len(own_cores()), 1, -1) if config.ppo.shares_out(cores)), 1)
     prepare_jax(devices=wanted or even)
     if jax.default_backend() != "cpu":
@@ -204,8 +205,8 @@ def update_until_done(
                 numbers["train/core_seconds"] = before + time.process_time()
                 require_finite(numbers["loss/value"], "ppo.learning_rate")
                 recent = []
+                metrics.write(numbers)  # before the checkpoint: a run that continues drops lines after it
                 save(learner)
-                metrics.write(numbers)
                 say(console, words)
                 aside += time.monotonic() - paused
     return learner

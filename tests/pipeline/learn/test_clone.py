@@ -30,6 +30,7 @@ from levelproof.levelgen.mirror import mirror
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.pipeline.learn import clone as module
+from levelproof.pipeline.learn import pool as pool_module
 from levelproof.pipeline.learn import sealed
 from levelproof.pipeline.learn.clone import COURSE
 from levelproof.pipeline.learn.curves import draw_curves
@@ -190,6 +191,16 @@ def test_pool_has_the_mirror_images_that_solve(split: Path) -> None:
     for lane in range(len(pool.steps) - count):
         same = np.abs(starts - np.asarray(image.position)[..., lane : lane + 1]).max((0, 1)) == 0
         assert same.any()
+
+
+def test_pool_may_have_no_mirror_image(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mirrored = pool_module.mirrored
+    nothing = lambda *arguments: jax.tree.map(lambda x: x[:0], mirrored(*arguments))
+    monkeypatch.setattr(pool_module, "mirrored", nothing)
+    config = CloneConfig(where="label = 'solved'")
+    data = module.source_of(split, replace(config, validation=0.3), print).data
+    plain_pool, pool = (read_pool(data, np.arange(4), config.network, mirror=each) for each in (False, True))
+    jax.tree.map(np.testing.assert_array_equal, pool, plain_pool)
 
 
 def test_second_clone_is_refused_where_one_runs(split: Path, tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.exchange.level_json import export
 from levelproof.pipeline.learn import published
-from levelproof.pipeline.learn.looks import LOOKS
+from levelproof.pipeline.learn.looks import LOOKS, log_look
 from levelproof.pipeline.learn.measured import midway_levels
 from levelproof.pipeline.learn.sealed import SEALED, known_sealed
 from levelproof.pipeline.learn.solve_rates import interval, solve_rates
@@ -58,9 +58,9 @@ def test_experts_of_a_split_stand_beside_the_baselines(split: Path, tmp_path: Pa
     assert specialists_of(split, ids, 3).solved.shape == (len(ids), 3)
     with pytest.raises(UserError, match=r"lacks 1 of the levels, such as 2000000000:"):
         specialists_of(split, np.array([ids[0], 2_000_000_000]), 1)
-    words = "--on", str(split), "--experts", str(split), "--levels", "4", *ONCE
+    words = "--on", str(split), "--experts", str(split), str(split), "--levels", "4", *ONCE
     (group,) = facts(tmp_path, *words)["levels"]
-    assert list(group["of"]["all"])[-1] == name
+    assert list(group["of"]["all"])[-2:] == [name, f"{name}, {split}"], "none replaces another of its budget"
 
 
 @pytest.mark.campaign
@@ -212,6 +212,13 @@ def test_each_look_at_the_sealed_levels_is_logged(tmp_path: Path) -> None:
     looks = [json.loads(line) for line in (policy / LOOKS).read_text().splitlines()]
     assert [look["on"]["sealed s"]["levels"] for look in looks] == [4, 4]
     assert {look["attempts"] for look in looks} == {1}
+
+
+def test_linked_log_of_looks_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "published").touch()
+    (tmp_path / LOOKS).symlink_to(tmp_path / "published")
+    assert log_look(tmp_path / LOOKS, "policy", [], 1, 0) is None
+    assert not (tmp_path / "published").read_text()
 
 
 @pytest.mark.slow

@@ -17,10 +17,12 @@ from levelproof.configs.meanings import comments_in
 from levelproof.configs.train import TrainConfig
 from levelproof.experts.generalist.config import CurriculumConfig, EvolveConfig, PPOConfig, ReplayConfig
 from levelproof.experts.generalist.train import _programs as programs
+from levelproof.experts.networks.saved import WEIGHTS, Policy
 from levelproof.levelgen.task.lanes import FIRST_EXTRA
 from levelproof.pipeline.exchange.level_json import export
 from levelproof.pipeline.learn import sealed
 from levelproof.pipeline.learn import train as module
+from levelproof.pipeline.learn.folder import weights_digest
 from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.trained_on import levels_for
 from tests.pipeline.command import ROOT, assert_refused, here
@@ -144,6 +146,29 @@ def continues_bit_for_bit(words: tuple[str, ...], tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.slow
+def test_run_killed_before_its_checkpoint_repeats_the_line_of_its_metrics(
+    easy: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keep, kept = module.keep_run, list[Any]()
+
+    def killed(out: Path, policy: Policy, learner: Any) -> None:
+        kept.append(learner)
+        if len(kept) == 2:
+            raise KeyboardInterrupt
+        keep(out, policy, learner)
+
+    monkeypatch.setattr(module, "keep_run", killed)
+    words = ["train", "-o", "agent", f"ppo.env_steps={3 * PER_UPDATE}", "interval=1", *LANES, *easy]
+    assert here(words, tmp_path).returncode != 0
+    stopped = metrics(tmp_path / "agent")
+    assert [line["train/updates"] for line in stopped] == [1, 2]
+    assert here(words, tmp_path).returncode == 0
+    curve = metrics(tmp_path / "agent")
+    assert [line["train/updates"] for line in curve] == [1, 2, 3]
+    assert curve[0] == stopped[0]
+
+
+@pytest.mark.slow
 def test_start_keeps_its_weights_while_the_critic_fits(
     agent: Path, split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -228,6 +253,7 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (["levels=replay", "evolve.edits=4"], "no effect with levels=replay"),
         (["levels=evolve", "replay.capacity=4"], "evolve.children is 64: it must not exceed 2"),
         (["ppo.kl_weight=1"], "no effect without start"),
+        (["start=policy", "ppo.kl_updates=8"], "ppo.kl_updates has no effect without ppo.kl_weight"),
         (["start=policy", "network.width=8"], "network.width is that of the policy to start from"),
         (["distribution=kinetx"], "did you mean kinetix?"),
         (["size=q"], "Cannot sample levels"),
@@ -248,11 +274,21 @@ def test_folder_of_another_run_is_refused(agent: Path, easy: tuple[str, ...], tm
     assert_refused(here(["train", *LANES, *easy, "seed=1"], tmp_path), 2, "has a run with other settings or levels")
 
 
-@pytest.mark.parametrize("note", [{"splits": [], "settings": {"where": ""}}, {"settings": {"ppo": 1}}, []])
+@pytest.mark.parametrize(
+    "note", [{"splits": [], "settings": {"where": ""}}, {"settings": {"ppo": 1}}, {"cores": 7}, []]
+)
 def test_folder_with_the_note_of_another_command_is_refused(note: Any, tmp_path: Path) -> None:
     (tmp_path / "agent").mkdir()
     (tmp_path / "agent" / "run.json").write_text(json.dumps(note))
     assert_refused(here(["train", *LANES, *TINY], tmp_path), 2, "has a run with other settings or levels")
+
+
+def test_training_starts_from_linked_weights(agent: Path, tmp_path: Path) -> None:
+    """As those of a policy downloaded from the Hugging Face hub are."""
+    for file in agent.iterdir():
+        (tmp_path / file.name).symlink_to(file)
+    assert weights_digest(str(tmp_path)) == weights_digest(str(agent))
+    assert (tmp_path / WEIGHTS).is_symlink()
 
 
 def test_guides_list_every_setting_with_its_default_and_meaning() -> None:
