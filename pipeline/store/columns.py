@@ -191,7 +191,8 @@ DESCRIBED = (
         "seconds",
         pa.struct([pa.field(stage, pa.float32()) for stage in Seconds._fields]),
         "Time that the level cost, of a core, or of a GPU if `device` is one: sampling (and labels without an expert), "
-        "search, training, evaluation, idle slots, replay of witnesses, writing, compiling",
+        "search, training, evaluation, idle slots, replay of witnesses, writing, compiling; by the clock, so other "
+        "work on the core makes it longer",
         "s",
         "not measured",
         since=7,
