@@ -270,7 +270,7 @@ def _require_no_network(start: str, overrides: Iterable[Override]) -> None:
     """Raise ConfigError if settings change the network of a policy to start from."""
     for override in overrides if start else ():
         if (name := override.key_or_group).startswith("network."):
-            raise ConfigError(f"{name} is that of the policy to start from: leave it out, or leave out start.")
+            raise ConfigError(f"{name} cannot change the network of the policy in start: leave out {name} or start.")
 
 
 def _changed(cls: type[T], overrides: Iterable[Override]) -> T:

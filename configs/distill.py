@@ -23,7 +23,7 @@ class DistillConfig:
     episodes: int = 512  # episodes that the learner plays in a round, each in another level
     states: int = 256  # states of these episodes that teachers are asked about in a round
     failed: float = 0.9  # share of these states from episodes that did not reach the goal
-    path: int = 16  # env steps of a teacher's way to the goal to learn from, evenly spaced; 1: the state asked alone
+    path: int = 16  # maximum env steps to learn from a teacher's path to the goal, evenly spaced; 1: only the first
     buffer: int = 65_536  # transitions of teachers in memory, the latest ones
     witnesses: float = 0.5  # share of the transitions of an update that are from the levels' witnesses
     seed: int = 0  # seed of the initial weights and of all random draws

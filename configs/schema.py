@@ -83,7 +83,7 @@ class JobConfig:
     level_files: str = ""  # a level file, or a folder of them, to label instead of random levels; empty: random levels
     budget: str = "128k"  # env steps an expert may use; also names the folder
     out: str = "data"  # folder or object store's URL; the split is written to {out}/{budget}/{size}
-    unit: int | None = None  # levels per work unit (redone if its worker dies); null: as many as take 20 to 60 s
+    unit: int | None = None  # levels per work unit (redone if its worker dies); null: enough for 20 to 60 s of work
     executor: Executor = "auto"  # ray: one worker per core or GPU; inline: this process; auto: inline if levels are few
     device: Literal["cpu", "gpu"] = "cpu"  # cpu: each worker has a core; gpu: a GPU, if one is free and JAX can use it
     workers: int = 0  # maximum number of workers; 0: one per core that memory allows, or with device=gpu one per GPU

@@ -20,7 +20,7 @@ class TrainConfig:
     size: str = "s"  # size of random levels
     distribution: str = "kinetix"  # preset of random levels
     where: str = "label NOT IN ('trivial', 'unsolvable')"  # SQL condition that selects levels of a split
-    starts: int = 1  # states in which a split's levels start: theirs, and evenly spaced ones along their witness
+    starts: int = 1  # start states per level of a split: its initial state, and others evenly spaced along its witness
     start: str = ""  # folder of a policy to continue training, with its network; empty: from scratch
     cores: int = 0  # CPU cores; 0: as many as divide the lanes evenly; a resumed run keeps its number
     interval: int = 25  # updates between lines of metrics, each with a checkpoint

@@ -158,7 +158,7 @@ class _Attempt(NamedTuple):
 class _Queue(NamedTuple):
     """Lanes that take one episode of a batch after another, and the results of those that ended."""
 
-    episode: Int[Array, " lane"]  # number of the lane's episode; as many as there are: none is left for the lane
+    episode: Int[Array, " lane"]  # index of the lane's episode; the number of episodes: the lane has finished
     attempt: _Attempt
     coming: Int[Array, ""]  # number of the episode that starts next
     solved: Bool[Array, " episode"]

@@ -31,9 +31,9 @@ class ImitationConfig:
     batch: int = 1024  # transitions of an update
     learning_rate: float = 1e-3  # largest step size of AdamW; falls to 0 along a cosine
     warmup: int = 500  # updates over which the step size grows from 0; at most half of all
-    weight_decay: float = 1e-4  # of AdamW
+    weight_decay: float = 1e-4  # AdamW's weight decay
     max_gradient_norm: float = 1.0  # maximum global norm of the gradient
-    average: float = 0.999  # weight of the past in the running average of the weights, which is the policy
+    average: float = 0.999  # decay per update of the running average of the weights, which becomes the policy
 
     def __post_init__(self) -> None:
         require(self, ("updates", "batch"), 1)

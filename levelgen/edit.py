@@ -221,12 +221,15 @@ def _edited(level: Level, change: Callable[[Level], None]) -> Level:
     after: Level = jax.tree.map(lambda x: np.asarray(x)[..., None], one)
     bodies = one.state.position[FIXED_POLYGONS:][one.model.active[FIXED_POLYGONS:]]
     if not np.isfinite(after.state.position).all() or np.abs(bodies).max(initial=0) > 2 * WORLD_SIDE:
-        raise EditError("That is too far outside the world.")
+        raise EditError(
+            "A body would lie too far outside the world: "
+            f"keep its coordinates between {-2 * WORLD_SIDE:g} and {2 * WORLD_SIDE:g} m."
+        )
     return replace(after, model=replace(after.model, collides=np.asarray(collision_matrix(after.model))))
 
 
 def _free(active: Any, kind: str, level: Level) -> int:
-    """Return the first inactive row, or raise EditError, in which `kind` names the rows."""
+    """Return the first inactive row; if there is none, raise EditError. `kind` names the rows in its message."""
     if active.all():
         raise EditError(f"Size {name_of(level.size)} has no room for more {kind}: delete one, or use a larger size.")
     return int(active.argmin())
@@ -250,7 +253,7 @@ def _movable_group(one: Level, body: int) -> list[int]:
     """Return a body and all bodies that move with it; raise EditError if one of them is scenery."""
     group = _joined(one, _movable(one, body))
     if min(group) < FIXED_POLYGONS:
-        raise EditError("A joint holds it to the scenery, which cannot move: delete that joint first.")
+        raise EditError("Joints hold this body to the scenery, which cannot move: delete a joint between them first.")
     return group
 
 

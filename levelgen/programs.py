@@ -1,8 +1,8 @@
 """Programs that processes share: one makes them, the others load them without tracing the function.
 
-JAX's own cache is found by the traced program, and tracing takes longer than loading. Here a program is found by the
-function's name, its static arguments, the shapes of the others, all sources, versions and settings of JAX: a file with
-this key names the file of the program, which is found by the traced program, too, when other sources lead to it.
+JAX's own cache looks programs up by their trace, and tracing takes longer than loading. Here the key consists of the
+function's name, its static arguments, the shapes of the others, all sources, and JAX's versions and settings. The key's
+file names the program's file, which in turn is named after the trace, so that keys of other sources can share it.
 """
 
 import hashlib

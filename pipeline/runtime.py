@@ -25,7 +25,7 @@ XLA_FLAGS = (
 )
 XLA_THREADS = "NPROC", "PJRT_NPROC"  # size of XLA's pool
 NUMPY_THREADS = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
-NO_GPU = "JAX cannot use one here, which needs levelproof's extra `gpu`"
+NO_GPU = "JAX finds no usable GPU (check that levelproof's extra `gpu` is installed)"
 LAST_CHECK = "looked"  # file beside the programs, touched when a check begins; programs older than it were readable
 CLAIM_SECONDS = 2.0  # s for which a worker tries to claim a core
 CLAIMS: list[socket.socket] = []  # sockets that mark this process's core as taken

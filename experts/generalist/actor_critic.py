@@ -15,7 +15,7 @@ from levelproof.physics.types import Size
 
 
 class ActorCriticParams(NamedTuple):
-    """Parameters of both; a policy's folder has the policy's alone."""
+    """Parameters of a policy and of its value function; a policy's folder contains only `policy`."""
 
     policy: VariableDict
     value: VariableDict

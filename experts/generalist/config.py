@@ -26,7 +26,7 @@ class PPOConfig:
     clip: float = 0.2  # maximum change of the probability ratio, and of the value, in either direction
     value_weight: float = 0.5  # weight of the value function's loss
     entropy_weight: float = 0.01  # weight of the policy's entropy, a bonus in the loss
-    average: float = 0.95  # weight of the past, an update, in the running average of the weights, which is the policy
+    average: float = 0.95  # decay per update of the running average of the weights, which becomes the policy
     # with start=POLICY
     critic_updates: int = 10  # first updates, which fit the value function and leave the policy as it is
     kl_weight: float = 0.0  # weight of the divergence from the start, a penalty in the loss; falls linearly to 0

@@ -35,7 +35,7 @@ class Playing(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """Episodes that end at a step; of the others, what they are so far."""
+    """Each lane's episode after every step: its final values where `done`, else its values so far."""
 
     done: Bool[Array, "time lane"]
     goal: Bool[Array, "time lane"]
@@ -65,7 +65,7 @@ def lanes_of(size: Size, rules: TaskParams) -> Lanes:
 
 
 def table_of(levels: Level | Sampler, rules: TaskParams) -> Table:
-    """Return levels as a table from which lanes copy theirs; a sampler is its own."""
+    """Return the table from which lanes copy their levels; a sampler is its own table."""
     return lanes_of(levels.size, rules).table(EnvParams(levels))
 
 

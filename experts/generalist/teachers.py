@@ -148,7 +148,7 @@ def attempt_from(
     player: Player, params: Any, level: Level, now: TaskState, keys: Key[Array, " state"], attempts: int,
     rules: TaskParams,
 ) -> tuple[Found, Int[Array, " state"]]:  # fmt: skip
-    """Play `attempts` times on from each state, until one reaches the goal or the episode's env steps are over.
+    """Play `attempts` continuations of each state, until one reaches the goal or the episode runs out of env steps.
 
     Args:
         player: chooses actions.

@@ -245,7 +245,7 @@ def _epochs(
         return jax.lax.scan(learn, now, jax.random.permutation(key, count).reshape(ppo.minibatches, -1))
 
     state = learner.optimiser
-    if starts:  # the policy's moments were those of no gradient, which would make its first steps too long
+    if starts:  # reset Adam when the policy starts to learn: moments of zero gradients make its first steps too long
         fresh = optimiser_of(ppo).init(learner.params)
         state = jax.tree.map(lambda new, old: jnp.where(update == ppo.critic_updates, new, old), fresh, state)
     (params, state), means = jax.lax.scan(epoch, (learner.params, state), jax.random.split(key, ppo.epochs))

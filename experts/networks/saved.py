@@ -123,7 +123,8 @@ def load_policy(folder: str | os.PathLike[str]) -> Policy:
         config = json.loads((path / CONFIG).read_text())
         if config["format"] != FORMAT:
             raise PolicyError(
-                f"The policy {path} has format {config['format']}, but this levelproof reads {FORMAT}: update it."
+                f"The policy {path} has format {config['format']}, but this levelproof reads format {FORMAT}: "
+                "update levelproof."
             )
         shape = config["network"]
         network = NetworkConfig(**shape | {"kind": PolicyKind(shape["kind"])})

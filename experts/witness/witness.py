@@ -59,7 +59,9 @@ def replay(level: Level, action: ArrayLike, rules: TaskParams = DEFAULT_RULES) -
     actions = np.asarray(action, np.int32)
     count = actions.shape[-1]
     if not 0 < count == len(level):
-        raise ValueError(f"there are {len(level)} levels and actions for {count}: give at least one, and as many")
+        raise ValueError(
+            f"there are {len(level)} levels and actions for {count}: pass at least one level, and actions for each"
+        )
     parts = [jax.device_get(replay_block(take(level, lanes), actions[..., lanes], rules)) for lanes in blocks(count)]
     return jax.tree.map(lambda *xs: np.ascontiguousarray(np.concatenate(xs, -1)[..., :count]), *parts)
 

@@ -134,7 +134,8 @@ def to_kinetix(size: Size, arrays: Any, names: Mapping[str, str]) -> Fields:
 def fillers(level: Level) -> Fields:
     """Return the values that the reference's sampler leaves in fields that nothing reads, level axis first.
 
-    It also draws the vertices of a rectangle for each circle: in seven of ten they are CIRCLE_VERTICES, as in all here.
+    For each circle, that sampler also draws the vertices of a rectangle, which are CIRCLE_VERTICES in 70% of cases;
+    this function always returns CIRCLE_VERTICES.
     """
     scenery = np.arange(level.size.polygons)[:, None] < FIXED_POLYGONS
     polygons, circles = np.split(np.asarray(level.model.active), [level.size.polygons])

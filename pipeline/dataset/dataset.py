@@ -234,8 +234,8 @@ class Dataset:
     ) -> EpisodeBatch:
         """Read the first episodes of trajectories: env steps as rows, one episode after another.
 
-        What a record has after its first episode repeats it, in seeds, or is another success in the same level. Of
-        seeds, only first episodes are simulated, side by side: the more at once, the faster.
+        In a seed file, the rest of a record repeats its first episode; in other splits it may hold other successes in
+        the same level. For seed files, only first episodes are simulated, side by side: the more at once, the faster.
 
         Args:
             indices: integer indices of trajectories [episode], in any order, with repetitions; a scalar counts as [1].

@@ -67,7 +67,7 @@ def make(
     kinds, resets = (action_type, observation_type), (auto_reset, final_observation)
     if split is not None:
         if distribution is not None:
-            raise UserError("distribution= is that of a size's random levels, and a split has its own: leave it out.")
+            raise UserError("distribution= is only for random levels, but split= has its own levels: leave it out.")
         return _of_split(split, where, rules, kinds, resets)
     if where is not None:
         raise UserError("where= is a condition on the levels of a split: pass split= with it, not levels.")
@@ -75,7 +75,7 @@ def make(
     if isinstance(levels, str | Size):
         levels = sampler(levels, _distribution(distribution))
     elif distribution is not None:
-        raise UserError("distribution= is that of a size's random levels: pass a size such as 's' with it.")
+        raise UserError("distribution= is only for random levels: pass a size such as 's' as levels, or leave it out.")
     return environment.make(levels, *kinds, rules or DEFAULT_RULES, *resets)
 
 

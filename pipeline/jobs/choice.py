@@ -17,8 +17,8 @@ def runs_here(job: JobConfig, levels: int) -> bool:
     """Return whether the command's own process makes the job's levels.
 
     Args:
-        job: its executor decides, unless that is "auto". Then only a job runs here that names no cluster, no GPU and
-            no second worker, and that is small: levels with a larger budget count more.
+        job: its executor decides, unless that is "auto". Then the job runs here if RAY_ADDRESS is unset, the job asks
+            for no GPU and no second worker, and the product of levels and budget is small.
         levels: number of levels to make.
     """
     if job.executor != "auto":

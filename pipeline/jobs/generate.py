@@ -203,12 +203,12 @@ def _spent(manifest: Manifest, made: np.ndarray, spent: EnvSteps) -> str:
     rows = manifest.table.filter(np.isin(manifest.level_ids, made))
     steps, label = (rows.column(name).to_numpy() for name in ("env_steps", "label"))
     shares = {
-        "of searches": spent.searched,
-        "of training that solved its level": steps[label == Label.SOLVED].sum(),
-        "of training that did not": steps[label == Label.UNSOLVED].sum(),
-        "of evaluations": spent.evaluated,
+        "in searches": spent.searched,
+        "in training on solved levels": steps[label == Label.SOLVED].sum(),
+        "in training on unsolved levels": steps[label == Label.UNSOLVED].sum(),
+        "in evaluations": spent.evaluated,
         "in empty slots": spent.idle,
-        "of replayed witnesses": spent.replayed,
+        "in replays of witnesses": spent.replayed,
     }
     parts = ", ".join(f"{share / sum(spent):.0%} {name}" for name, share in shares.items() if share)
     return f"{sum(spent):,} env steps: {parts}."

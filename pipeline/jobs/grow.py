@@ -41,7 +41,8 @@ def grow(source: Path, out: Path, settings: Sequence[str], console: Console) -> 
     """
     if wrong := [setting for setting in settings if setting.partition("=")[0] not in SETTINGS]:
         raise UserError(
-            f"{wrong[0]} cannot be set, because the seeds decide it: leave it out. Only {', '.join(SETTINGS)} can."
+            f"`levelproof grow` does not accept {wrong[0]}: leave it out. It accepts {', '.join(SETTINGS)}; the seeds "
+            "decide every setting that affects results."
         )
     if not is_seed(source):
         raise UserError(

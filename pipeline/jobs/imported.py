@@ -137,7 +137,8 @@ def _require_same_folder(folder: Folder, parts: list[UnitOfRows], split: Path) -
         wanted = _file(folder, part.array, part.first)
         if (file := files.get(part.unit.level_ids[0], wanted)) != wanted:
             raise UserError(
-                f"{split} has {file} where {wanted} would be: one folder makes one split, so import into another one."
+                f"{split} was imported from another folder (it has {file} instead of {wanted}): one folder makes one "
+                "split, so name a new split with -o."
             )
 
 

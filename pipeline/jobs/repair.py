@@ -144,7 +144,7 @@ def _not_regenerated(findings: Findings) -> list[str]:
     sentences = []
     for reason in dict.fromkeys(findings.unrepairable.values()):
         ids = [level_id for level_id, why in findings.unrepairable.items() if why == reason]
-        sentences.append(f"Not regenerated: {runs_text(runs(ids))}, for {reason}.")
+        sentences.append(f"Not regenerated: {runs_text(runs(ids))}. Reason: {reason}.")
     ids = [i for i in findings.lost if from_files(findings.config or {}) and i not in findings.origins]
     if nameless := (findings.missing if from_files(findings.config or {}) else []) + runs(ids):
         sentences.append(f"Not regenerated: {runs_text(nameless)}, whose level files no row names.")

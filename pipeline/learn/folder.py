@@ -84,7 +84,7 @@ def weights_digest(policy: str) -> str | None:
 
 
 def require_finite(loss: float, setting: str) -> None:
-    """Raise Failure if a loss is not a number, because the weights are not either, and must not be kept."""
+    """Raise Failure if a loss is not finite: the weights then are not either, and must not replace the checkpoint."""
     if not math.isfinite(loss):
         raise Failure(
             f"The loss is {loss}, so the weights have diverged: start again with a smaller {setting} and another -o "

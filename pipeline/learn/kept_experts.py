@@ -22,7 +22,7 @@ WITHOUT = "set teachers.expert=0 to do without them"
 
 
 def experts_of(split: Path, level_ids: Int[np.ndarray, " level"]) -> KnownExperts:
-    """Load the experts of these levels; of a split by URL and of seeds none.
+    """Load the experts of these levels; none if the split is remote or a seed file.
 
     Raises:
         UserError: other users can write to the experts.

@@ -31,7 +31,7 @@ class Metrics:
         steps: int,
         say: Callable[[str], None],
     ):
-        """Open the files of a run in `folder` that has come to `steps` of its curves; forget what is of later ones.
+        """Open the metrics files of a run in `folder`; drop lines whose `curves.step` is beyond `steps`.
 
         Raises:
             UserError: the logger's library is missing, or a link or the like has the name of a file.

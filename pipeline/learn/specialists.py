@@ -1,4 +1,4 @@
-"""What levels' own experts do, as the rows of a split say, to stand beside a policy for all levels."""
+"""Attempts of the levels' own experts, from a split's rows or the sealed levels' file, to compare with a policy."""
 
 from pathlib import Path
 from typing import NamedTuple

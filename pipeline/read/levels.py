@@ -100,7 +100,8 @@ def check_sampler(manifest: Manifest) -> None:
     )
     if made_with not in ALIKE_VERSIONS:
         raise Failure(
-            f"{what} {SAMPLER_VERSION}, which makes others from their ids: use the levelproof that made them."
+            f"{what} {SAMPLER_VERSION}, which makes different levels from the same ids: "
+            "use the levelproof that made the split."
         )
     warnings.warn(
         f"{what} {SAMPLER_VERSION}: those without a witness differ in the last places of their numbers.",

@@ -20,6 +20,6 @@ def require_size(policy: Policy, size: Size, levels: str, advice: str) -> None:
     """Raise UserError, with advice, if the policy cannot play levels of this size; `levels` names them."""
     if policy.size is not None and not policy.can_play(size):
         raise UserError(
-            f"The policy plays levels of size {name_of(policy.size)} only, and those of {levels} have {name_of(size)}: "
-            f"{advice}."
+            f"The policy plays levels of size {name_of(policy.size)} only, but the levels of {levels} have size "
+            f"{name_of(size)}: {advice}."
         )

@@ -113,7 +113,7 @@ def begun_like(job: JobConfig) -> ExpertState:
 
 
 def require_plain(file: Path | IO[bytes], size: int) -> None:
-    """Raise ValueError if an archive of `size` bytes is compressed or claims to hold more: ours never are or do."""
+    """Raise ValueError if an archive is compressed or declares more than its `size` bytes; this program writes none."""
     with ZipFile(file) as archive:
         parts = archive.infolist()
     if any(part.compress_type != ZIP_STORED for part in parts) or sum(part.file_size for part in parts) > size:

@@ -208,7 +208,7 @@ def _taken(path: Path, text: bytes, say: Callable[[str], None]) -> Version:
         if before and before != (writer, version):
             if writer and before[0] == writer:
                 raise UserError(
-                    f"Another `levelproof generate` is writing to {as_typed(path.parent)}: wait for it, or stop it."
+                    f"Another levelproof command is writing to {as_typed(path.parent)}: wait for it, or stop it first."
                 )
             since = now
         before = writer, version

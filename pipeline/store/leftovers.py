@@ -59,7 +59,7 @@ def clean(split: Path, say: Callable[[str], None]) -> Manifest:
             remove(path)
     if kept := sorted(path for path in set(unnamed) - set(dead) if begun_path(path) not in begun):
         more = f" and {len(kept) - 1} more like it" if kept[1:] else ""
-        say(f"No fragment names {kept[0]}{more}: delete what is not named by a fragment that you store elsewhere.")
+        say(f"No fragment names {kept[0]}{more}: delete this data, unless a fragment that you keep elsewhere names it.")
     return manifest
 
 

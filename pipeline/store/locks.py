@@ -44,7 +44,7 @@ def only_writer(split: Path, say: Callable[[str], None]) -> Iterator[None]:
         return
     with open(split / WRITER_LOCK, "a+", opener=regular) as file:
         if not _taken_within(PATIENCE, file):
-            raise UserError(f"Another `levelproof generate` is writing to {split}: wait for it, or stop it first.")
+            raise UserError(f"Another levelproof command is writing to {split}: wait for it, or stop it first.")
         with named(split, file):
             yield
 

@@ -165,7 +165,7 @@ class Shard:
         return self.restore([(self, rows)], table_for(self.size), [range(len(rows))]).unlike
 
     def restore(self, parts: Sequence["Part"], table: Sequence[FieldSpec], places: Sequence[Sequence[int]]) -> Restored:
-        """Read rows of shards of this one's kind and encoding, level axis first; `places` are theirs in the result.
+        """Read rows of shards of this class and encoding, level axis first; `places`: positions in the result.
 
         Raises:
             Failure: as `read`.

@@ -268,7 +268,7 @@ def _note_losses(rows: pa.Table, recipe: Recipe, findings: Findings) -> None:
     for row, same in zip(rows.to_pylist(), same_stack(rows), strict=True):
         level_id = row["level_id"]
         if not same:
-            findings.unrepairable[level_id] = f"it was made with other versions or on another device ({row['device']})"
+            findings.unrepairable[level_id] = f"made with other versions or on another device ({row['device']})"
         if recipe.distribution is None:
             findings.origins[level_id] = origin_of(recipe.split, row | {"shard": None})
             try:

@@ -62,7 +62,7 @@ def test_body_joined_to_the_scenery_cannot_be_moved() -> None:
     held = int(level.model.joint_a[0])
     level = jax.tree.map(lambda x: x[..., None], level)
     for edit in (lambda: move(level, held, 1, 1), lambda: turn(level, held, 0.3), lambda: resize(level, held, 1.5)):
-        with pytest.raises(EditError, match="A joint holds it to the scenery"):
+        with pytest.raises(EditError, match="Joints hold this body to the scenery"):
             edit()
     fix(level, held, True)
 

@@ -50,7 +50,8 @@ class LevelSource:
                 raise ConfigError("engine_version is not a number")
         except (ValueError, KeyError, TypeError) as error:
             raise Failure(
-                f"The seed file {path} has settings that this levelproof does not accept ({error})."
+                f"The seed file {path} has settings that this levelproof does not accept ({error}): "
+                "use the levelproof that wrote it."
             ) from None
         sampler = config.get("sampler_version")
         if distribution is not None and sampler != SAMPLER_VERSION:

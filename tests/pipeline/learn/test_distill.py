@@ -196,7 +196,10 @@ def test_levels_are_witnessed_and_neither_trivial_nor_sealed(split: Path, monkey
         (["none"], "none"),
         (["SPLIT", "stats=3"], "did you mean states?"),
         (["SPLIT", "start=none"], "There is no policy in none"),
-        (["SPLIT", "start=policy", "network.width=8"], "network.width is that of the policy to start from"),
+        (
+            ["SPLIT", "start=policy", "network.width=8"],
+            "network.width cannot change the network",
+        ),
         (["SPLIT", "witnesses=1"], "witnesses is 1"),
         (["SPLIT", "failed=2"], "failed is 2"),
         (["SPLIT", "teachers.witness=0", "teachers.random=0", "teachers.learner=0"], "kept no experts"),

@@ -254,7 +254,7 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (["levels=evolve", "replay.capacity=4"], "evolve.children is 64: it must not exceed 2"),
         (["ppo.kl_weight=1"], "no effect without start"),
         (["start=policy", "ppo.kl_updates=8"], "ppo.kl_updates has no effect without ppo.kl_weight"),
-        (["start=policy", "network.width=8"], "network.width is that of the policy to start from"),
+        (["start=policy", "network.width=8"], "network.width cannot change the network of the policy in start"),
         (["distribution=kinetx"], "did you mean kinetix?"),
         (["size=q"], "Cannot sample levels"),
         (["start=none"], "There is no policy in none"),

@@ -101,7 +101,7 @@ def test_locks_exclude_on_nfs_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(locks, "NOTICE", 0.1)
     with held_elsewhere("only_writer", tmp_path):
         assert is_written(tmp_path)
-        with pytest.raises(UserError, match="Another `levelproof generate`"), only_writer(tmp_path, print):
+        with pytest.raises(UserError, match="Another levelproof command"), only_writer(tmp_path, print):
             pass
     assert not is_written(tmp_path)
     with only_writer(tmp_path, print):

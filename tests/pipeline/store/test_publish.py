@@ -333,7 +333,7 @@ def test_lease_refuses_a_second_writer_while_it_is_renewed(
     monkeypatch.setattr(leases, "RENEWAL", 0.05)
     with leases.leased(THERE, print):
         assert is_written(THERE)
-        with pytest.raises(UserError, match=r"Another `levelproof generate` is writing to s3://bucket/data/128k/s"):
+        with pytest.raises(UserError, match=r"Another levelproof command is writing to s3://bucket/data/128k/s"):
             drive(OUT)
     assert not is_written(THERE)
     drive(OUT)

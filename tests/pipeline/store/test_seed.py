@@ -188,7 +188,7 @@ def test_grow_leaves_out_levels_whose_bits_differ(
 def test_grow_refuses_another_name_and_foreign_settings(seed: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="-o data/128k/s"):
         grow(seed, tmp_path / "256k/s", INLINE, QUIET)
-    with pytest.raises(UserError, match="the seeds decide it"):
+    with pytest.raises(UserError, match="does not accept size=m"):
         grow(seed, tmp_path / "128k/s", ["size=m"], QUIET)
     with pytest.raises(UserError, match="There is no seed file at"):
         grow(tmp_path / "none.parquet", tmp_path / "128k/s", INLINE, QUIET)

@@ -117,7 +117,7 @@ def test_writing_names_a_file_in_its_way(tmp_path: Path, job: JobConfig, place: 
 def test_writing_refuses_a_second_writer(job: JobConfig) -> None:
     with writing(job, print) as (split, _):
         assert is_written(split)
-        with pytest.raises(UserError, match="Another `levelproof generate` is writing"), writing(job, print):
+        with pytest.raises(UserError, match="Another levelproof command is writing"), writing(job, print):
             pass
     assert not is_written(split)
     with writing(job, print):
