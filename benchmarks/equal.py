@@ -81,8 +81,8 @@ def run(args: argparse.Namespace) -> Report:
             f"of 8 attempts at them: the {players[SOLVED]['random']['levels']:,} that are labelled solved.",
             *(f"{way}: `levelproof train {shown(settings_of(args, way, 0))}`." for way in args.ways),
             f"![Share of episodes that reach the goal in training, against core-seconds]({PLOT})",
-            "In the plot, each episode is in a random level never played before, and the weights are those that act; "
-            "the table measures their average, which is what is saved.",
+            "The plot has the weights as they act, in random levels never played before, or in the levels that a way "
+            "trains on; the table measures the average of the weights, which is what is saved, in sealed levels.",
         ],
         plots={PLOT: partial(draw, results)},
     )  # fmt: skip

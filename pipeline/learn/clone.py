@@ -66,7 +66,7 @@ def clone(splits: Sequence[Path], config: CloneConfig, out: Path, console: Conso
         require_same_run(out, note)
         state = continued(out, begin_imitation(np.int32(config.seed), config.network, size, config.train))
         write_note(out, note)
-        metrics, done = Metrics(out, COURSE, config.log, note, int(state.updates), tell), False
+        metrics, done = Metrics(out, COURSE, config.log, note, int(state.updates), tell, require_ours), False
 
         def save(state: Imitation) -> None:
             require_ours()

@@ -137,7 +137,7 @@ def distill(split: Path, config: DistillConfig, out: Path, console: Console) -> 
         now = continued(out, fresh)
         now = now._replace(labels=jax.device_get(now.labels))
         write_note(out, note)
-        metrics, done = Metrics(out, COURSE, config.log, note, int(now.imitation.updates), tell), False
+        metrics, done = Metrics(out, COURSE, config.log, note, int(now.imitation.updates), tell, require_ours), False
 
         def save(now: Distillation) -> None:
             require_ours()

@@ -30,13 +30,24 @@ class Metrics:
         settings: Mapping[str, Any],
         steps: int,
         say: Callable[[str], None],
+        require_ours: Callable[[], None],
     ):
         """Open the metrics files of a run in `folder`; drop lines whose `curves.step` is beyond `steps`.
+
+        Args:
+            folder: the run's, which another process may make again.
+            curves: what to draw.
+            log: name of a logger, or none.
+            settings: for the logger.
+            steps: of the checkpoint that the run continues.
+            say: tells the user a sentence.
+            require_ours: raises if another process has made the folder again.
 
         Raises:
             UserError: the logger's library is missing, or a link or the like has the name of a file.
         """
         require_library(log)
+        self._require_ours = require_ours
         self._path, self._curves, self._log = folder / METRICS, curves, GuardedLog(log, say)
         lines = read_regular(self._path).decode().splitlines() if os.path.lexists(self._path) else []
         kept = [line for line in lines if line.endswith("}") and json.loads(line)[curves.step] <= steps]
@@ -46,7 +57,11 @@ class Metrics:
             self._log.open(lambda: writer_of(log, folder / LOG, curves.step, folder.name, settings))
 
     def write(self, numbers: Mapping[str, float]) -> None:
-        """Append a line with the numbers that exist: NaN stands for one that does not, and is not JSON."""
+        """Append a line with the numbers that exist: NaN stands for one that does not, and is not JSON.
+
+        Raises what `require_ours` raises.
+        """
+        self._require_ours()
         numbers = {name: number for name, number in numbers.items() if np.isfinite(number)}
         with self._path.open("a") as file:
             file.write(json.dumps(numbers) + "\n")

@@ -86,7 +86,7 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
         learner = jax.tree.map(lambda x, like: jax.device_put(x, like.sharding), continued(out, fresh), fresh)
         steps = int(learner.updates) * config.ppo.steps_per_update
         write_note(out, note)
-        metrics, done = Metrics(out, COURSE, config.log, note, steps, tell), False
+        metrics, done = Metrics(out, COURSE, config.log, note, steps, tell, require_ours), False
 
         def save(learner: Learner) -> None:
             require_ours()

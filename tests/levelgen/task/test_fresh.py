@@ -66,8 +66,14 @@ def test_make_takes_a_preset_and_names_unknown_ones() -> None:
     assert env.size == levelproof.SIZES["m"]
     for arguments, message in (
         ({"distribution": "tidy"}, "There is no distribution 'tidy': choose one of"),
-        ({"levels": levelproof.sample_levels([1], "s"), "distribution": "clutter"}, "pass a size such as 's' with it"),
-        ({"levels": None, "split": "data/128k/s", "distribution": "clutter"}, "a split has its own: leave it out"),
+        (
+            {"levels": levelproof.sample_levels([1], "s"), "distribution": "clutter"},
+            "pass a size such as 's' as levels",
+        ),
+        (
+            {"levels": None, "split": "data/128k/s", "distribution": "clutter"},
+            "split= has its own levels: leave",
+        ),
     ):
         with pytest.raises(levelproof.UserError, match=message):
             levelproof.make(**({"levels": "m"} | arguments))

@@ -32,7 +32,7 @@ def out(tmp_path: Path) -> Path:
 def test_metrics_write_to_no_file_elsewhere(out: Path, profile: Path, kind: str) -> None:
     PLANTED[kind](out / f".{CURVES}", profile)
     PLANTED[kind](out / CURVES, profile)
-    Metrics(out, COURSE, "none", {}, 0, print).write(NUMBERS)
+    Metrics(out, COURSE, "none", {}, 0, print, list).write(NUMBERS)
     assert profile.read_bytes() == MINE
     assert not profile.with_name("new").exists()
     assert (out / CURVES).read_bytes().startswith(b"\x89PNG")
@@ -43,7 +43,7 @@ def test_metrics_log_into_no_folder_elsewhere(out: Path, tmp_path: Path) -> None
     (tmp_path / "elsewhere").mkdir()
     (out / LOG).symlink_to(tmp_path / "elsewhere")
     messages: list[str] = []
-    Metrics(out, COURSE, "tensorboard", {}, 0, messages.append)
+    Metrics(out, COURSE, "tensorboard", {}, 0, messages.append, list)
     assert [text for text in messages if "policy/log is a link" in text] == messages
     assert not list((tmp_path / "elsewhere").iterdir())
 
@@ -51,7 +51,7 @@ def test_metrics_log_into_no_folder_elsewhere(out: Path, tmp_path: Path) -> None
 @pytest.mark.parametrize("kind", ["link", "pipe", "socket"])
 def test_clone_refuses_irregular_files(out: Path, profile: Path, kind: str) -> None:
     reads: dict[str, Any] = {
-        METRICS: lambda: Metrics(out, COURSE, "none", {}, 0, print),
+        METRICS: lambda: Metrics(out, COURSE, "none", {}, 0, print, list),
         run_folder.RUN: lambda: run_folder.require_same_run(out, {}),
         run_folder.CHECKPOINT: lambda: run_folder.continued(out, jnp.zeros(3)),
     }

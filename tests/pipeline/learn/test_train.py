@@ -73,7 +73,7 @@ def test_solve_rate_rises_on_an_easy_set(agent: Path) -> None:
 
 def test_metrics_leave_out_numbers_that_do_not_exist(tmp_path: Path) -> None:
     """No episode may end in an interval, and then there is no solve rate. JSON has no NaN."""
-    log = Metrics(tmp_path, module.COURSE, "none", {}, 0, print)
+    log = Metrics(tmp_path, module.COURSE, "none", {}, 0, print, list)
     log.write({module.COURSE.step: 1, "loss/value": 0.5, "train/solve_rate": np.nan})
     assert metrics(tmp_path) == [{module.COURSE.step: 1, "loss/value": 0.5}]
     assert (tmp_path / "curves.png").exists()
