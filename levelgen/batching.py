@@ -4,7 +4,7 @@ A batch with fewer lanes than its program is padded with copies of its last lane
 """
 
 from collections.abc import Iterator
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -35,9 +35,14 @@ def at_once(lanes: int, in_cache: int) -> int:
 
 def take(tree: T, lanes: np.ndarray | slice) -> T:
     """Select these lanes from every array; in slices, numpy arrays are views."""
-    quick = lambda x: not isinstance(lanes, slice) and isinstance(x, np.ndarray) and x.flags.c_contiguous
-    # `np.take` is three times as fast as an index, but would first copy an array of another layout
-    return jax.tree.map(lambda x: np.take(x, lanes, -1) if quick(x) else x[..., lanes], tree)
+
+    def select(x: Any) -> Any:
+        # `np.take` is three times as fast as an index, but would first copy an array of another layout
+        if isinstance(x, np.ndarray) and x.flags.c_contiguous and not isinstance(lanes, slice):
+            return np.take(x, lanes, -1)
+        return x[..., lanes]
+
+    return jax.tree.map(select, tree)
 
 
 def repeat(tree: T, lanes: int) -> T:
