@@ -85,4 +85,4 @@ def observe(
     """
     if kind == ObservationType.SYMBOLIC_FLAT:
         return symbolic_flat(level, state, constant)
-    return OF_LEVEL_AND_STATE[kind](replace(level, state=state), state)
+    return changing_features(kind, level, state)
