@@ -234,13 +234,14 @@ def compose_train(overrides: Sequence[str]) -> "TrainConfig":
     config = _changed(TrainConfig, parsed)
     names = [override.key_or_group for override in parsed]
     random = config.levels in CURRICULA
-    useless = ("where", "starts") if random else ("size", "distribution")
+    useless = ("where", "choice", "starts") if random else ("size", "distribution")
     for name in names:
         if name.partition(".")[0] in useless:
             kind = "random levels" if random else "the levels of a split or of files"
             raise ConfigError(f"{name} has no effect on {kind}, as levels={config.levels} names: leave it out.")
-        if config.levels not in READ_BY.get(name.partition(".")[0], [config.levels]):
-            raise ConfigError(f"{name} has no effect with levels={config.levels}: leave it out.")
+        if config.chosen_by not in READ_BY.get(name.partition(".")[0], [config.chosen_by]):
+            chosen = f"levels={config.levels}" if random else f"choice={config.choice}"
+            raise ConfigError(f"{name} has no effect with {chosen}: leave it out.")
         if not config.start and name in ("ppo.critic_updates", "ppo.kl_weight", "ppo.kl_updates"):
             raise ConfigError(f"{name} has no effect without start: leave it out.")
         if name == "ppo.kl_updates" and not config.ppo.kl_weight:

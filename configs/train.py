@@ -20,6 +20,7 @@ class TrainConfig:
     size: str = "s"  # size of random levels
     distribution: str = "kinetix"  # preset of random levels
     where: str = "label NOT IN ('trivial', 'unsolvable')"  # SQL condition that selects levels of a split
+    choice: Literal["uniform", "learnability", "replay"] = "uniform"  # how levels of a split or of files are chosen
     starts: int = 1  # start states per level of a split: its initial state, and others evenly spaced along its witness
     start: str = ""  # folder of a policy to continue training, with its network; empty: from scratch
     cores: int = 0  # CPU cores; 0: as many as divide the lanes evenly; a resumed run keeps its number
@@ -28,9 +29,14 @@ class TrainConfig:
     log: Literal["none", "tensorboard", "wandb"] = "none"  # logger of scalars, besides metrics.jsonl
     network: NetworkConfig = field(default_factory=NetworkConfig)  # network of a policy from scratch
     ppo: PPOConfig = field(default_factory=PPOConfig)  # training of the policy
-    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)  # choice of levels with levels=learnability
-    replay: ReplayConfig = field(default_factory=ReplayConfig)  # choice of levels with levels=replay or evolve
+    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)  # choice of levels by learnability
+    replay: ReplayConfig = field(default_factory=ReplayConfig)  # choice of levels by replay, and by evolve
     evolve: EvolveConfig = field(default_factory=EvolveConfig)  # new levels with levels=evolve
+
+    @property
+    def chosen_by(self) -> str:
+        """Name of the curriculum that chooses among random levels, or among those of a split or of files."""
+        return self.levels if self.levels in CURRICULA else self.choice
 
     def __post_init__(self) -> None:
         require(self, ("interval", "starts"), 1)

@@ -77,9 +77,9 @@ class PPOConfig:
 class CurriculumConfig:
     """Settings of the curriculum by learnability (hashable: pass as a static argument)."""
 
-    share: float = 0.5  # share of episodes in levels that the measurement kept; the others play fresh levels
+    share: float = 0.5  # share of episodes in levels that the measurement kept; the others draw from all
     every: int = 100  # updates between measurements
-    candidates: int = 1024  # fresh levels that are measured
+    candidates: int = 1024  # levels that are measured, drawn from all
     measured_steps: int = 1024  # env steps of a measurement in each level; episodes have up to 256
     keep: int = 256  # levels with the highest learnability, p(1 - p) of the solve rate p, that are kept
 

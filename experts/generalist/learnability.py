@@ -23,8 +23,9 @@ class Learnable(NamedTuple):
 def learnability(config: CurriculumConfig) -> Curriculum:
     """Return the curriculum.
 
-    Every `every` updates the policy attempts fresh levels. Those with the largest p(1 - p), where p is their solve
-    rate, are drawn until the next measurement, mixed with fresh levels.
+    Every `every` updates the policy attempts levels drawn uniformly, which are fresh ones if levels are random. Those
+    with the largest p(1 - p), where p is their solve rate, are drawn until the next measurement, mixed with others
+    drawn uniformly.
     """
 
     def draw(table: Table, state: Learnable, key: Key[Array, ""], lanes: int) -> Int[Array, " lane"]:

@@ -142,12 +142,12 @@ def recipe_of(config: TrainConfig, source: TrainingLevels, start: Policy | None,
 
 
 def curriculum_of(config: TrainConfig, levels: Level | Sampler, rules: TaskParams) -> Curriculum:
-    """Return the curriculum named by `levels`; levels of a split or of files are drawn uniformly."""
-    if config.levels == "learnability":
+    """Return the curriculum that the settings name."""
+    if config.chosen_by == "learnability":
         return learnability(config.curriculum)
-    if config.levels == "replay":
+    if config.chosen_by == "replay":
         return replay(config.replay)
-    if config.levels == "evolve":
+    if config.chosen_by == "evolve":
         assert isinstance(levels, Sampler)
         return evolve(config.evolve, config.replay, levels, rules)
     return UNIFORM

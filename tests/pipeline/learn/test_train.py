@@ -196,17 +196,20 @@ def test_start_keeps_its_weights_while_the_critic_fits(
 
 
 @pytest.mark.campaign
-def test_random_levels_are_measured_for_learnability(tmp_path: Path) -> None:
-    words = ("levels=learnability", "curriculum.candidates=64", "curriculum.keep=16", "curriculum.every=2", *TINY)
-    out = trained(tmp_path, 3, "size=s", *words)
+@pytest.mark.parametrize("of_split", [False, True])
+def test_levels_are_measured_for_learnability(of_split: bool, split: Path, tmp_path: Path) -> None:
+    levels = (f"levels={split}", "choice=learnability") if of_split else ("levels=learnability", "size=s")
+    out = trained(tmp_path, 3, *levels, "curriculum.candidates=64", "curriculum.keep=16", "curriculum.every=2", *TINY)
     kept = load_file(out / "checkpoint.safetensors")
     usable = next(x for name, x in kept.items() if name.endswith("usable"))
     assert 0 < usable <= 16
 
 
 @pytest.mark.campaign
-def test_random_levels_are_replayed(tmp_path: Path) -> None:
-    out = trained(tmp_path, 6, "levels=replay", "replay.capacity=8", "replay.full_enough=1", *TINY)
+@pytest.mark.parametrize("of_split", [False, True])
+def test_levels_are_replayed(of_split: bool, split: Path, tmp_path: Path) -> None:
+    levels = (f"levels={split}", "choice=replay") if of_split else ("levels=replay",)
+    out = trained(tmp_path, 6, *levels, "replay.capacity=8", "replay.full_enough=1", *TINY)
     kept = {name: x for name, x in load_file(out / "checkpoint.safetensors").items() if name.startswith(".curriculum")}
     assert kept[".curriculum.cumulative"][-1] > 0
     assert np.isfinite(kept[".curriculum.score"]).all()
@@ -249,6 +252,9 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (["starts=0", "levels=some/split"], "starts is 0"),
         (["starts=2", "levels=file"], "starts=2 needs witnesses, but file is not a split"),
         (["curriculum.keep=4"], "no effect with levels=uniform"),
+        (["choice=learnability"], "choice has no effect on random levels"),
+        (["levels=some/split", "curriculum.keep=4"], "no effect with choice=uniform"),
+        (["levels=some/split", "choice=evolve"], "choice"),
         (["levels=replay", "replay.share=1"], "share is 1"),
         (["levels=replay", "evolve.edits=4"], "no effect with levels=replay"),
         (["levels=evolve", "replay.capacity=4"], "evolve.children is 64: it must not exceed 2"),
