@@ -47,6 +47,9 @@ WAYS = {
     "levels, clone, reinforcement": Way(TUNING, CLONE, "#d55e00"),
     "levels, clone, learnability": Way((*TUNING, "levels=learnability"), CLONE, "#e69f00"),
     "levels, clone, reinforcement on these levels": Way(TUNING, CLONE, "#cc79a7", own_levels=True),
+    "levels, clone, learnability on these levels": Way(
+        (*TUNING, "choice=learnability"), CLONE, "#999933", own_levels=True
+    ),
     "from builtin:s": Way(TUNING, "builtin:s", "#009e73"),
 }
 

@@ -5,12 +5,20 @@ from pathlib import Path
 import pytest
 
 from benchmarks.__main__ import parser
-from benchmarks.equal import SECONDS, run
+from benchmarks.equal import SECONDS, run, searched, split_of
+from levelproof import Failure
 
-pytestmark = pytest.mark.campaign
 TINY = ("ppo.environments=64", "ppo.horizon=32", "ppo.minibatches=4")
 
 
+def test_search_of_a_stopped_run_is_refused(tmp_path: Path) -> None:
+    args = parser("equal").parse_args(["equal", "--folder", str(tmp_path)])
+    split_of(args, 0).mkdir(parents=True)
+    with pytest.raises(Failure, match="remove it, so that its search counts as a whole"):
+        searched(args, 0)
+
+
+@pytest.mark.campaign
 def test_ways_end_at_the_same_core_seconds(tmp_path: Path) -> None:
     words = ["equal", "--ways", "from scratch", "levels, clone, reinforcement", "--core-seconds", "200"]
     words += ["--levels", "64", "--updates", "2", "--measured", "8", "--folder", str(tmp_path / "kept")]
