@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> Report:
         "labelled solved. One attempt at each level, or the best of 8.",
         f"Each policy took {args.updates:,} updates of 1,024 transitions{', with ' if args.set else ''}"
         f"{' '.join(f'`{setting}`' for setting in args.set)}. A tenth of the levels that it was cloned from were kept "
-        "from training, for validation.",
+        "from training, for validation. The last column plays at most 1,024 of the levels, that tenth included.",
     ]
     second = Table(
         ("baseline", "of all", "of solved", "of solved, best of 8"), others,

@@ -22,6 +22,7 @@ from levelproof.pipeline.learn.evaluate import ALL, SOLVED
 from levelproof.pipeline.runtime import own_cores
 
 FIRST = 50_000  # id of the first level to clone from; the measured ones are sealed
+BETWEEN_SEEDS = 10_000_000  # ids
 LARGE = ("ppo.environments=2048", "ppo.epochs=2")  # fewer, larger steps than the defaults'
 SCRATCH = (*LARGE, "ppo.learning_rate=3e-4", "ppo.entropy_weight=0.005", "network.width=64")
 TUNING = (*LARGE, "ppo.learning_rate=2e-4", "ppo.entropy_weight=0.002", "ppo.critic_updates=5")
@@ -76,7 +77,8 @@ def run(args: argparse.Namespace) -> Report:
         [Table(head, rows, f"Share of sealed levels of {args.size} solved with sampled actions; 95% intervals")],
         [
             f"Every policy has {args.core_seconds:,.0f} core-seconds of one core, with compiling, for all that it is "
-            f"made from: the search of {args.levels} levels (`procedure=label`, ids from {FIRST:,} on), the clone "
+            f"made from: the search of {args.levels} levels (`procedure=label`, ids from {FIRST:,} on, for the next "
+            f"seed from {FIRST + BETWEEN_SEEDS:,}), the clone "
             f"({', '.join((f'{args.updates:,} updates', *(f'`{each}`' for each in args.cloning)))}), and "
             "reinforcement for the rest, on random levels unless a way says otherwise; those of builtin:s do not "
             "count. *Of all*: "
@@ -130,7 +132,7 @@ def searched(args: argparse.Namespace, seed: int) -> float:
     if not file.exists():
         if out.exists():
             raise Failure(f"{out} was left by a run that was stopped: remove it, so that its search counts as a whole.")
-        job = f"levels={args.levels}", f"size={args.size}", f"first_level={FIRST + 10_000_000 * seed}"
+        job = f"levels={args.levels}", f"size={args.size}", f"first_level={FIRST + BETWEEN_SEEDS * seed}"
         words = *job, f"out={out}", "procedure=label", "budget=16k", "executor=inline"
         file.write_text(json.dumps({"core_seconds": timed_command("generate", *words)[1]}))
     return json.loads(file.read_text())["core_seconds"]

@@ -108,7 +108,7 @@ def learned(config: ReplayConfig, buffer: ReplayBuffer, ended: EndedEpisodes) ->
 
 
 def with_weights(config: ReplayConfig, buffer: ReplayBuffer) -> ReplayBuffer:
-    """Recompute the replay weights, which are whole numbers with an exact sum, from score ranks and ages."""
+    """Recompute the replay weights, which are integers with an exact sum, from score ranks and ages."""
     attempted = buffer.score > -jnp.inf
     order = jnp.argsort(-buffer.score)
     rank = jnp.zeros(config.capacity).at[order].set(jnp.arange(1.0, config.capacity + 1))

@@ -59,7 +59,7 @@ class Experience(NamedTuple):
 
 
 def lanes_of(size: Size, rules: TaskParams) -> Lanes:
-    """Return the environment in lanes; whoever steps it starts the next episodes, in levels of any table."""
+    """Return the environment in lanes; the caller starts the next episodes, in levels of any table."""
     unused = ObservationType.SYMBOLIC_ENTITY  # never computed: networks see for themselves
     return Lanes(environment.make(sampler(size), observation_type=unused, rules=rules, auto_reset=False)[0])
 

@@ -1,4 +1,4 @@
-"""Teachers of one policy for all levels: from any state of an episode they play on, and only what replays is a label.
+"""Teachers of one policy for all levels: they play on from any state, and only an attempt that replays is a label.
 
 A level's expert is asked first. If it does not reach the goal from a state in the env steps that its episode has left,
 a short search follows: variations of the level's witness, sticky random actions, and further attempts of the learner.
@@ -64,7 +64,7 @@ class Teacher(IntEnum):
 
 
 class Asked(NamedTuple):
-    """States of the learner's episodes, one per lane, of which teachers are asked."""
+    """States of the learner's episodes, one per lane, for teachers to label."""
 
     level: Level
     now: TaskState

@@ -87,6 +87,7 @@ class Chunk(NamedTuple):
     log_probability: Float[Array, " sample"]
     value: Float[Array, " sample"]
     advantage: Float[Array, " sample"]
+    counts: Bool[Array, " sample"]  # whether the action is learned from
     logits_of_start: Float[Array, "logit sample"]
 
 
@@ -107,7 +108,7 @@ def programs_of(recipe: TrainingRecipe, table: Table, start: VariableDict | None
 
 @lru_cache(maxsize=8)
 def _programs(recipe: TrainingRecipe, shapes: tuple[jax.ShapeDtypeStruct, ...], tree: Any, cores: int) -> Programs:
-    """Make the programs once for equal arguments: a function that is jitted anew is traced and compiled anew."""
+    """Make the programs once for equal arguments: jitting a function again would trace and compile it again."""
     mesh = Mesh(np.array(jax.devices()[:cores]), (CORES,))
     whole = PartitionSpec()
     shape = jax.eval_shape(partial(_begin, recipe), *jax.tree.unflatten(tree, shapes))
@@ -180,13 +181,17 @@ def _of_all_cores(ended: Ended) -> EndedEpisodes:
     return jax.tree.map(lambda x: jax.lax.all_gather(x.reshape(-1), CORES, tiled=True), mine)
 
 
-def _advantages(experience: Experience, config: PPOConfig) -> Float[Array, "time lane"]:
-    """Estimate advantages; where the task did not end an episode, later rewards are the value of the last state seen.
+def _open_ended(experience: Experience) -> Bool[Array, "time lane"]:
+    """Mark the last steps before the time limit, or the rollout's end, cuts an episode off."""
+    return (experience.done & ~experience.terminated).at[-1].set(~experience.terminated[-1])
 
-    That is the state before the time limit's last step, or the rollout's, whose action then counts for nothing. So no
-    state has to go through the network a second time.
+
+def _advantages(experience: Experience, config: PPOConfig) -> Float[Array, "time lane"]:
+    """Estimate advantages; where an episode is cut off, later rewards are the value of the last state seen.
+
+    That state's own action then counts for nothing. So no state has to go through the network a second time.
     """
-    open_ended = (experience.done & ~experience.terminated).at[-1].set(~experience.terminated[-1])
+    open_ended = _open_ended(experience)
     reward = jnp.where(open_ended, experience.value, experience.reward)
     over = experience.done | open_ended
     return advantages(experience.value, reward, over, jnp.zeros_like(reward[0]), config)
@@ -205,7 +210,7 @@ def _chunks(recipe: TrainingRecipe, experience: Experience, start: VariableDict 
     of_start = jnp.zeros((len(experience.value), 0, lanes))
     chunks = Chunk(
         experience.seen, experience.live, experience.action, experience.log_probability, experience.value, advantage,
-        of_start,
+        ~_open_ended(experience), of_start,
     )  # fmt: skip
     chunks = jax.tree.map(cut, chunks)
     if start is None:
@@ -233,7 +238,8 @@ def _epochs(
             return jax.tree.map(jnp.add, total, (gradient, means)), None
 
         zeros = jax.tree.map(jnp.zeros_like, (params, (0.0,) * TERMS))
-        total, _ = jax.lax.scan(add, zeros, (batch, normalised(batch.advantage)))
+        gain = jnp.where(batch.counts, normalised(batch.advantage), 0.0)
+        total, _ = jax.lax.scan(add, zeros, (batch, gain))
         gradient, means = jax.lax.pmean(jax.tree.map(lambda x: x / len(index), total), CORES)
         if starts:
             gradient = gradient._replace(policy=jax.tree.map(lambda x: jnp.where(fitting, 0, x), gradient.policy))

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from jaxtyping import Int
 
 from levelproof.experts.labels import Label
@@ -30,7 +31,7 @@ def specialists_of(split: Path, level_ids: Int[np.ndarray, " level"], attempts: 
     attempts is drawn, because a row has only their share.
 
     Raises:
-        UserError: there is no such split, or it lacks a level.
+        UserError: there is no such split, it lacks a level, or none of its solved levels has a rate.
         Failure: the split is damaged.
     """
     manifest = require_manifest(split, ["level_id", "label", "success_rate", "budget"])
@@ -43,6 +44,11 @@ def specialists_of(split: Path, level_ids: Int[np.ndarray, " level"], attempts: 
             "another split with --experts."
         )
     rows = table.take([row_of[level_id] for level_id in level_ids.tolist()])
+    rates = table.filter(pc.field("label") == Label.SOLVED)["success_rate"]
+    if len(rates) and rates.null_count == len(rates):
+        raise UserError(
+            f"{split} has no success rates, as after procedure=label: name a split of another procedure with --experts."
+        )
     own = config.get("expert", {}).get("attempts", ATTEMPTS)
     solved = _drawn(successes_of(rows, own), own, attempts)
     return Specialists(_named(rows["budget"][0].as_py()), solved)

@@ -58,6 +58,8 @@ def test_experts_of_a_split_stand_beside_the_baselines(split: Path, tmp_path: Pa
     assert specialists_of(split, ids, 3).solved.shape == (len(ids), 3)
     with pytest.raises(UserError, match=r"lacks 1 of the levels, such as 2000000000:"):
         specialists_of(split, np.array([ids[0], 2_000_000_000]), 1)
+    with pytest.raises(UserError, match="16k/m has no success rates, as after procedure=label"):
+        specialists_of(ROOT / "manifests" / "16k" / "m", np.arange(3), 1)
     words = "--on", str(split), "--experts", str(split), str(split), "--levels", "4", *ONCE
     (group,) = facts(tmp_path, *words)["levels"]
     assert list(group["of"]["all"])[-2:] == [name, f"{name}, {split}"], "none replaces another of its budget"
