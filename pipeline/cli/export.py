@@ -83,5 +83,6 @@ def run(arguments: argparse.Namespace) -> None:
             f'select it with --where, as in --where "level_id = {level_id}".'
         )
     if out is None:
-        raise UserError(f"No output path: name the folder to write with -o, as in -o {arguments.format}.")
+        kind, name = ("file", "levels.parquet") if arguments.format == "seed" else ("folder", arguments.format)
+        raise UserError(f"No output path: name the {kind} to write with -o, as in -o {name}.")
     FORMATS[arguments.format](split, where, out, *filter(None, [arguments.actions]))

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from levelproof.pipeline.cli.command import add_json, add_split
+from levelproof.pipeline.errors import UserError
 
 SUMMARY = "show the contents of a split"
 EXAMPLE = """\
@@ -37,7 +38,8 @@ def run(arguments: argparse.Namespace) -> None:
     from levelproof.pipeline.store.columns import with_current_names
 
     names = with_current_names(arguments.columns).split(",") if arguments.columns else None
-    columns = names and [name.strip() for name in names]
+    columns = names and list(dict.fromkeys(name.strip() for name in names))
+    _require_effect(arguments)
     query = RowQuery(arguments.where, columns, arguments.sort, arguments.limit)
     if arguments.csv:
         return write_csv(arguments.split, query, sys.stdout)
@@ -48,3 +50,14 @@ def run(arguments: argparse.Namespace) -> None:
     from levelproof.pipeline.look.inspect import inspect
 
     return inspect(arguments.split, query, arguments.json, arguments.against)
+
+
+def _require_effect(arguments: argparse.Namespace) -> None:
+    """Raise UserError for an option that the chosen output ignores."""
+    output = "csv" if arguments.csv else "plot" if arguments.plot else ""
+    given = {"against": bool(arguments.against)}
+    if output == "plot":
+        given |= {name: getattr(arguments, name) is not None for name in ("columns", "sort", "limit")}
+    for name in given:
+        if output and given[name]:
+            raise UserError(f"--{name} has no effect with --{output}: leave one of them out.")

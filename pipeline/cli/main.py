@@ -34,8 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str] | None) -> int:
     arguments, unknown = _parser().parse_known_args(argv)
-    if hasattr(arguments, "words") and not any(word.startswith("-") for word in unknown):
-        arguments.words, unknown = [*arguments.words, *unknown], []  # argparse leaves over the words after an option
+    unknown = _taken(arguments, unknown)
     warnings.showwarning = lambda message, *_: print(f"Warning: {message}", file=sys.stderr)
     try:
         if unknown:
@@ -60,8 +59,24 @@ def _run(argv: Sequence[str] | None) -> int:
         )
 
 
+def _taken(arguments: argparse.Namespace, unknown: list[str]) -> list[str]:
+    """Take arguments that follow an option, which argparse leaves over; return those that the command does not have."""
+    if any(word.startswith("-") for word in unknown):
+        return unknown
+    for name in ("words", "settings"):
+        if hasattr(arguments, name):
+            setattr(arguments, name, [*getattr(arguments, name), *unknown])
+            return []
+    if len(unknown) == 1 and unknown[0].isdecimal() and getattr(arguments, "level_id", 0) is None:
+        arguments.level_id = int(unknown[0])
+        return []
+    return unknown
+
+
 def _no_option(word: str, takes_settings: bool) -> str:
     """Return the error for an argument that the command does not have."""
+    if not word.startswith("-"):
+        return f"There is no argument {word}: --help lists them."
     advice = "write settings as NAME=VALUE, as in size=m" if takes_settings else "--help lists the options"
     return f"There is no option {word}: {advice}."
 

@@ -93,6 +93,8 @@ def batches_of(
     together: int = 1,
 ) -> Batches[T]:
     """Iterate over the batches of epochs in an order. Other arguments as `Batches`; `prefetch` None: two per core."""
+    if epochs is not None and epochs < 0:
+        raise UserError(f"epochs is {epochs}: it must be at least 0, or None for endless batches.")
     settings |= {"batch_size": order.batch_size, "seed": order.seed, "process_count": order.process_count}
     count = None if epochs is None else epochs * order.batches
     ahead = 2 * together * len(own_cores()) if prefetch is None else prefetch

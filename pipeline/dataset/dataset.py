@@ -37,6 +37,7 @@ from levelproof.pipeline.read.rows import COLUMNS, current_rows, gather_rows, sa
 from levelproof.pipeline.read.select import columns_in, select
 from levelproof.pipeline.store.columns import schema_of
 from levelproof.pipeline.store.fields import tree_of
+from levelproof.pipeline.store.fragment import FULL
 from levelproof.pipeline.store.manifest import require_manifest
 from levelproof.pipeline.store.named import open_shard
 from levelproof.pipeline.store.seed.file import is_seed
@@ -79,6 +80,7 @@ class Dataset:
     Attributes:
         split: path or URL of the split.
         rules: task rules that the trajectories were played by.
+        simulates: whether reading simulates, because records are not stored whole.
     """
 
     def __init__(self, split: Path, where: str | None, columns: Sequence[str], validation: float) -> None:
@@ -95,6 +97,7 @@ class Dataset:
         self._manifest, self._lock = rows.combine_chunks(), Lock()
         self._shard = lru_cache(OPEN_SHARDS)(open_shard)
         self.rules: TaskParams = rules_of(manifest)
+        self.simulates = any(fragment.densities != {*FULL} for fragment in manifest.counting)
 
     @property
     def manifest(self) -> pa.Table:

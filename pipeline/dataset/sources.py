@@ -17,6 +17,8 @@ from levelproof.pipeline.errors import UserError
 class Readable(Protocol):
     """The methods of `Dataset` that a source calls."""
 
+    @property
+    def simulates(self) -> bool: ...
     def read(self, indices: Any, length: Any, first: Any, fields: Any, observation: Any, /) -> Batch: ...
     def grain(self, subset: Any, length: Any, fields: Any, observation: Any, /) -> "TrajectorySource": ...
 
@@ -24,8 +26,8 @@ class Readable(Protocol):
 class TrajectorySource:
     """A grain RandomAccessDataSource and a map-style PyTorch dataset, from `Dataset.grain` and `Dataset.torch`.
 
-    Its pickle is small: a worker process reopens the split. Forked workers cannot compute observations, because JAX
-    may already be initialised in their parent; spawned workers can.
+    Its pickle is small: a worker process reopens the split. Forked workers can compute neither observations nor what a
+    record does not store, because JAX may already be initialised in their parent; spawned workers can.
     """
 
     def __init__(
@@ -52,10 +54,14 @@ class TrajectorySource:
     def __getitems__(self, items: Sequence[int]) -> list[dict[str, Any]]:
         """Return several elements; torch calls this, if present, to read a batch at once."""
         _, length, fields, observation = self._settings
-        if observation and os.getpid() != self._process:
+        if os.getpid() != self._process and (observation or self._data.simulates):
+            what, way = (
+                ("simulate records, which this split does not store whole,", "")
+                if self._data.simulates
+                else ("compute observations", ", or pass observation=None")
+            )
             raise UserError(
-                "A forked process cannot compute observations with JAX: pass the DataLoader "
-                "multiprocessing_context='spawn', or pass observation=None."
+                f"A forked process cannot {what} with JAX: pass the DataLoader multiprocessing_context='spawn'{way}."
             )
         chosen = np.asarray(items, np.int64)
         if not ((chosen >= 0) & (chosen < len(self))).all():

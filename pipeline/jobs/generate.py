@@ -178,7 +178,8 @@ def _work(
                 raise Failure(outcome.fatal)
             if outcome.summary:
                 events.ended(outcome)
-                sealer.committed(unit)
+                if outcome.summary.levels:
+                    sealer.committed(unit)
                 continue
             last = scheduler.failed(unit)
             events.ended(outcome, last)

@@ -83,8 +83,10 @@ def import_folder(folder: Path, out: Path, console: Console) -> Exit:
             with sealing(split, manifest.counting, partial(say, console)) as sealer:
                 for part, first in zip(shown, firsts, strict=False):
                     reported = sum(skipped.values())
-                    skipped.update(_import(job, split, source, part, shlex.join(command), console, reported))
-                    sealer.committed(part.unit)
+                    wrong = _import(job, split, source, part, shlex.join(command), console, reported)
+                    skipped.update(wrong)
+                    if len(wrong) < len(part.unit.level_ids):
+                        sealer.committed(part.unit)
                     sealer.advance(first)
         except KeyboardInterrupt:
             say(console, "Stopped: committed units stay; run the same command to continue.")

@@ -11,6 +11,7 @@ from itertools import chain
 from pathlib import Path
 
 import duckdb
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
@@ -26,8 +27,11 @@ from levelproof.pipeline.look.preview import preview
 from levelproof.pipeline.look.readme import FIGURES, MARK, PREVIEW, RATES, SHEET, STEPS, CardOptions, SplitFacts, readme
 from levelproof.pipeline.read.levels import distribution_of, writing_to
 from levelproof.pipeline.store.disk import NotRegular
+from levelproof.pipeline.store.files import write
 from levelproof.pipeline.store.layout import SHARDS
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
+from levelproof.pipeline.store.named import bytes_named
+from levelproof.pipeline.store.seed.file import SUFFIX, is_seed
 from levelproof.pipeline.store.shard import stored_bytes
 from levelproof.pipeline.version import __version__
 
@@ -45,7 +49,7 @@ def card(splits: Sequence[Path], out: Path | None, options: CardOptions) -> None
         UserError: a split is missing or not below the file's folder, or the file exists and is not a card.
         Failure: a split is damaged.
     """
-    out = out or splits[0].absolute().parent.parent / README
+    out = out or _above(splits[0]) / README
     folder = out.absolute().parent.resolve()
     _require_ours(out)
     _require_plain([out])
@@ -61,12 +65,18 @@ def card(splits: Sequence[Path], out: Path | None, options: CardOptions) -> None
             pq.write_table(table, folder / PREVIEW / f"{split_facts.subset}.parquet", row_group_size=100)
         figures = _draw(folder, facts, tables)
         name = options.name or (options.repo or folder.name).rpartition("/")[2]
-        out.write_text(readme(name, facts, options, figures, __version__), encoding="utf-8")
+        write(out, readme(name, facts, options, figures, __version__).encode())
     print(f"{out}: the card of {', '.join(paths)}, with {PREVIEW}/ and {FIGURES}/ beside it.")
     if not options.license:
         print("It names no licence: choose one with --license, such as cc-by-4.0 or mit.")
     excluded = '--exclude "*.lock" --exclude "*/job.json" --exclude "*/events/*" --exclude "*/.*"'
     print(f"Next:  hf upload {options.repo or 'USER/NAME'} {shlex.quote(str(folder))} . --repo-type dataset {excluded}")
+
+
+def _above(split: Path) -> Path:
+    """Return the folder of a dataset: above `{budget}/`, or that of a seed file."""
+    whole = split.absolute()
+    return whole.parent.parent if whole.is_dir() else whole.parent
 
 
 def _require_ours(out: Path) -> None:
@@ -95,21 +105,35 @@ def _facts(path: str, manifest: Manifest) -> SplitFacts:
     table = manifest.table
     labels = {entry["values"]: entry["counts"] for entry in table.column("label").value_counts().to_pylist()}
     solved = table.filter(manifest.labels == Label.SOLVED)
-    shards = manifest.split / SHARDS
+    split, witnesses = manifest.split, table.num_rows - table.column("shard").null_count
+    shards, seeds = split / SHARDS, is_seed(split)
+    if seeds:  # a record repeats its first episode
+        rows, transitions = f"{path}/*{SUFFIX}" if split.is_dir() else path, _total_steps(table)
+        split_bytes = shard_bytes = bytes_named(split, manifest.shards)
+    else:
+        rows, transitions, split_bytes = f"{path}/manifest/*.parquet", witnesses * RECORD_STEPS, stored_bytes(split)
+        shard_bytes = stored_bytes(shards) if shards.is_dir() else 0
     return SplitFacts(
         path=path,
+        seeds=seeds,
+        rows=rows,
         labels=labels,
         distinct=len(table.column("content_hash").unique()),
-        witnesses=table.num_rows - table.column("shard").null_count,
+        witnesses=witnesses,
+        transitions=transitions,
         steps_to_goal=solved.column("steps_to_goal").to_numpy(),
-        split_bytes=stored_bytes(manifest.split),
-        shard_bytes=stored_bytes(shards) if shards.is_dir() else 0,
+        split_bytes=split_bytes,
+        shard_bytes=shard_bytes,
         budget=table.column("budget")[0].as_py(),
         distribution=_distribution(manifest),
         config_hash=manifest.config_hash or "",
         stored_as=", ".join(sorted(set[str]().union(*(fragment.densities for fragment in manifest.counting)))),
         made_with=_made_with(table),
     )
+
+
+def _total_steps(table: pa.Table) -> int:
+    return int(np.nansum(table.column("steps_to_goal").to_numpy()))
 
 
 def _distribution(manifest: Manifest) -> str:

@@ -15,12 +15,13 @@ from jaxtyping import Bool
 from rich.console import Console
 from rich.table import Table
 
+from levelproof.configs.schema import REPEATED
 from levelproof.experts.labels import TRAINED, WITNESSED, Label
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look import cost
 from levelproof.pipeline.look.inspect import QUANTILES, SPENT
 from levelproof.pipeline.read.select import columns_in, select
-from levelproof.pipeline.store.manifest import changes_text, differences, require_manifest
+from levelproof.pipeline.store.manifest import Manifest, changes_text, differences, require_manifest
 from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.words import number
 
@@ -52,8 +53,9 @@ def compare(one: Path, other: Path, where: str | None = None, rows: int = 10) ->
     solved, tried = np.stack([_labelled(rows, WITNESSED) for rows in (left, right)]), _labelled(left, TRAINED)
     tried |= _labelled(right, TRAINED)
     only = [solved[i] & ~solved[1 - i] for i in range(2)]
-    ids, spent = left["level_id"].to_numpy(), [_spent(side) for side in (left, right)]
-    totals, gained = [sum(steps.values()) for steps in spent], int(only[1].sum() - only[0].sum())
+    ids, gained = left["level_id"].to_numpy(), int(only[1].sum() - only[0].sum())
+    spent = [_spent(side, manifest) for side, manifest in zip((left, right), manifests, strict=True)]
+    totals = [sum(steps.values()) if steps else 0 for steps in spent]
     costs = [cost.cost_of(side) for side in (left, right)]
     seconds = [sum(side["seconds"].values()) if side else 0.0 for side in costs]
     counts = [[int(mask.sum()) for mask in (side & tried, tried)] for side in solved]
@@ -73,7 +75,7 @@ def compare(one: Path, other: Path, where: str | None = None, rows: int = 10) ->
         "only_rows": [ids[mask][: max(rows, 0)].tolist() for mask in only],
         "labels": _label_changes(left, right),
         "env_steps": spent,
-        "env_steps_for_one_more": (totals[1] - totals[0]) / gained if gained else None,
+        "env_steps_for_one_more": (totals[1] - totals[0]) / gained if gained and all(spent) else None,
         "cost": costs,
         "seconds_for_one_more": (seconds[1] - seconds[0]) / gained if gained and all(costs) else None,
         "steps_to_goal": _paired(left, right, solved[0] & solved[1]),
@@ -116,7 +118,10 @@ def _labelled(rows: pa.Table, labels: frozenset[Label]) -> Bool[np.ndarray, " ro
     return pc.is_in(rows["label"].cast(pa.string()), names).to_numpy().copy()  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _spent(rows: pa.Table) -> dict[str, int]:
+def _spent(rows: pa.Table, manifest: Manifest) -> dict[str, int] | None:
+    """Total the env steps by stage; None in seeds, which do not have them."""
+    if REPEATED.items() <= (manifest.config or {}).items():
+        return None
     return {name: int(rows[name].to_numpy().sum()) for name in SPENT}
 
 
@@ -160,11 +165,11 @@ def _print(facts: dict[str, Any], console: Console) -> None:
     table.add_row("levels solved", *(f"{side['solved']:,}" for side in facts["solved"]), f"{gained:+,}")
     table.add_row("of undecided levels", *shares, f"p {_p(facts['p'])}")
     table.add_row("solved by this split only", *(f"{count:,}" for count in facts["only"]), "")
-    for name in SPENT:
+    for name in SPENT if all(facts["env_steps"]) else ():
         here, there = (side[name] for side in facts["env_steps"])
         if here or there:
             table.add_row(name.replace("_", " "), f"{here:,}", f"{there:,}", f"{there - here:+,}")
-    if all(facts["cost"]):
+    if all(facts["cost"]) and len({cost["of"] for cost in facts["cost"]}) == 1:
         here, there = (sum(side["seconds"].values()) for side in facts["cost"])
         table.add_row(f"{facts['cost'][0]['of']}-seconds", f"{here:,.0f}", f"{there:,.0f}", f"{there - here:+,.0f}")
     if steps := facts["steps_to_goal"]:

@@ -92,17 +92,19 @@ def _interval(ends: Sequence[float]) -> str:
     return " to ".join(f"{end:.1%}" for end in ends)
 
 
-def _steps(facts: Mapping[str, Any]) -> str:
+def _steps(facts: Mapping[str, Any]) -> str | None:
     """Describe env steps by stage."""
+    if facts["env_steps"] is None:
+        return None
     total = sum(facts[name] for name in STEPS)
     parts = [f"{facts[name] / total:.0%} {what}" for name, what in STEPS.items() if facts[name]]
     return f"{total:,} ({', '.join(parts)})" if total else "0"
 
 
-def _training(facts: Mapping[str, Any]) -> str:
+def _training(facts: Mapping[str, Any]) -> str | None:
     steps, after, unsolved = (facts[f"env_steps{suffix}"] for suffix in ("", "_after_success", "_unsolved"))
     if not steps:
-        return "0"
+        return None if steps is None else "0"
     return f"{steps:,} ({after / steps:.0%} after a first success, {unsolved / steps:.0%} of levels unsolved)"
 
 

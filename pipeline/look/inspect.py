@@ -94,6 +94,9 @@ def _summary(split: Path, manifest: Manifest, chosen: pa.Table, labels: dict[str
     is_repeated = REPEATED.items() <= (manifest.config or {}).items()  # then the others are copies
     transitions = _total(manifest.table["steps_to_goal"].to_numpy()) if is_repeated else kept * RECORD_STEPS
     distribution = distribution_of(manifest)
+    after = solved["env_steps"].to_numpy() - solved["steps_to_first_success"].to_numpy()
+    spent = {name: _total(chosen[name].to_numpy()) for name in SPENT}
+    spent |= {"env_steps_after_success": _total(after), "env_steps_unsolved": _total(unsolved["env_steps"].to_numpy())}
     return {
         "split": as_typed(split),
         "config_hash": manifest.config_hash,
@@ -109,9 +112,7 @@ def _summary(split: Path, manifest: Manifest, chosen: pa.Table, labels: dict[str
         "witness": _counts(chosen.select(["witness"]).filter(pc.is_valid(chosen["witness"])), "witness"),  # pyright: ignore[reportAttributeAccessIssue]
         "steps_to_goal": _quantiles(solved, "steps_to_goal"),
         "steps_to_first_success": _quantiles(solved, "steps_to_first_success"),
-        **{name: _total(chosen[name].to_numpy()) for name in SPENT},
-        "env_steps_after_success": _total(solved["env_steps"].to_numpy() - solved["steps_to_first_success"].to_numpy()),
-        "env_steps_unsolved": _total(unsolved["env_steps"].to_numpy()),
+        **(dict.fromkeys(spent) if is_repeated else spent),  # seeds leave costs behind
         "cost": cost.cost_of(chosen),
         "split_bytes": stored,  # all shards, whatever the condition
         "bytes_per_transition": stored / transitions if stored and kept else None,

@@ -1,6 +1,7 @@
 """Text of a dataset's card: Markdown under a YAML header, from facts about its splits. Reads and writes no files."""
 
 import datetime
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -49,9 +50,12 @@ class SplitFacts:
     """Facts about one split."""
 
     path: str  # below the dataset's folder, such as 64k/s
+    seeds: bool  # whether it is one or more seed files
+    rows: str  # path of its manifest's files, with `*`
     labels: Mapping[str, int]  # levels with each label
     distinct: int  # number of distinct contents
     witnesses: int  # number of trajectories
+    transitions: int  # env steps of them, without repetitions
     steps_to_goal: np.ndarray  # of solved levels
     split_bytes: int  # size of all its files
     shard_bytes: int
@@ -64,15 +68,11 @@ class SplitFacts:
     @property
     def subset(self) -> str:
         """Name of the hub's subset."""
-        return self.path.replace("/", "-")
+        return re.sub(r"[^\w-]", "-", self.path.removesuffix(".parquet"))
 
     @property
     def levels(self) -> int:
         return sum(self.labels.values())
-
-    @property
-    def transitions(self) -> int:
-        return self.witnesses * RECORD_STEPS
 
     @property
     def solved(self) -> Share | None:
@@ -93,12 +93,15 @@ def readme(name: str, splits: Sequence[SplitFacts], options: CardOptions, figure
         f"**{_short(total)} transitions that solve {_short(witnesses)} random physics levels, each proved by "
         f"replay.** Made by {_link('levelproof', options.code)} {version}.",
         _picture(SHEET, figures, "Levels of this dataset at the moment their witness reaches the goal"),
-        OVERVIEW.format(tried=f"{sum(split.levels for split in splits):,}"),
+        OVERVIEW.format(
+            tried=f"{sum(split.levels for split in splits):,}",
+            costs="" if any(split.seeds for split in splits) else ", with its search, learning curve and costs",
+        ),
         f"## Splits\n\nOne folder for each training budget and size, `{{budget}}/{{size}}`.\n\n{_sizes(splits)}",
         _picture(RATES, figures, "Share of tried levels that were solved, with 95% intervals"),
         _picture(STEPS, figures, "Number of steps that solved levels take"),
         _loading(splits, options),
-        _format(options),
+        _format(splits, options),
         _making(splits),
         _licence(options),
         _citation(options, version),
@@ -108,10 +111,10 @@ def readme(name: str, splits: Sequence[SplitFacts], options: CardOptions, figure
 
 def _header(name: str, splits: Sequence[SplitFacts], options: CardOptions) -> dict[str, Any]:
     total = sum(split.transitions for split in splits)
-    shown = [{"split": split.path.replace("/", "_"), "path": f"{PREVIEW}/{split.subset}.parquet"} for split in splits]
+    shown = [{"split": re.sub(r"\W", "_", split.path), "path": f"{PREVIEW}/{split.subset}.parquet"} for split in splits]
     configs: list[dict[str, Any]] = [{"config_name": PREVIEW, "default": True, "data_files": shown}]
     for split in splits:
-        files = [{"split": SUBSET_SPLIT, "path": f"{split.path}/manifest/*.parquet"}]
+        files = [{"split": SUBSET_SPLIT, "path": split.rows}]
         configs.append({"config_name": split.subset, "data_files": files})
     return {
         **({"license": options.license} if options.license else {}),
@@ -131,8 +134,8 @@ is a task of its own.
 
 - **Solved means replayed.** A level is `solved` only if replaying its actions from its initial state, through the \
 engine, reached the goal. `levelproof verify` repeats the replay on your machine.
-- **No level that was tried is left out.** The manifests have a row for each of {tried} levels, solved or not, with \
-its search, learning curve and costs; `trivial` and `unsolvable` levels have labels of their own, each with its reason.
+- **No level that was tried is left out.** The manifests have a row for each of {tried} levels, solved or not\
+{costs}; `trivial` and `unsolvable` levels have labels of their own, each with its reason.
 - **The whole world at every step**, stored or recomputed by the engine, bit for bit: draw it, observe it in any way, \
 or start an environment from it."""
 
@@ -161,9 +164,10 @@ def _sizes(splits: Sequence[SplitFacts]) -> str:
 
 def _loading(splits: Sequence[SplitFacts], options: CardOptions) -> str:
     repo, split = options.repo or "USER/NAME", splits[0]
+    included = split.rows if split.seeds else f"{split.path}/*"
     return f"""## Load it
 
-    hf download {repo} --repo-type dataset --local-dir data --include "{split.path}/*"
+    hf download {repo} --repo-type dataset --local-dir data --include "{included}"
 
 Trajectories, with {_link("levelproof", options.code)}:
 
@@ -178,20 +182,29 @@ for batch in data.batches(64, seed=0, subset="train"):  # (B, T, ...)
 The manifest is parquet. Without levelproof, with DuckDB:
 
 ```sql
-SELECT label, count(*), median(steps_to_goal) FROM 'hf://datasets/{repo}/{split.path}/manifest/*.parquet' GROUP BY label
+SELECT label, count(*), median(steps_to_goal) FROM 'hf://datasets/{repo}/{split.rows}' GROUP BY label
 ```
 
 or with the library `datasets`: `load_dataset("{repo}", "{split.subset}", split="{SUBSET_SPLIT}")`."""
 
 
-def _format(options: CardOptions) -> str:
-    return f"""## Format
-
+SHARDED = f"""
 - `manifest/*.parquet`: a row for every level that was tried: `label` and `label_reason`, `steps_to_goal`, success \
 rates, costs, `shard` and `row` of its data, and the command that remakes the row.
 - `shards/*.zarr`: zarr v3. A record of {RECORD_STEPS} steps for each level with a witness; the level restarts \
 whenever an episode ends. The split's density says how much of a record is stored; reading returns world, contacts, \
-action, reward, end and goal at any density. One trajectory is one compressed chunk with a checksum.
+action, reward, end and goal at any density. One trajectory is one compressed chunk with a checksum."""
+SEEDED = """
+- Seed files (`*.parquet`): a row for every level that was tried: its id, `label`, `steps_to_goal`, success rates, \
+and the actions of its first episode that reached the goal, packed into some ten bytes. levelproof makes the level \
+from its id and plays the actions when the row is read; a checksum tells whether the states are the original ones. \
+Costs and learning curves are not in them."""
+
+
+def _format(splits: Sequence[SplitFacts], options: CardOptions) -> str:
+    kinds = [SHARDED] * (not all(split.seeds for split in splits)) + [SEEDED] * any(split.seeds for split in splits)
+    return f"""## Format
+{"".join(kinds)}
 - `{PREVIEW}/*.parquet`: a sample of the levels with pictures, for the viewer.
 
 Columns and fields: {_link("docs/columns.md", options.code, "/blob/main/docs/columns.md")} and \
@@ -206,8 +219,10 @@ def _making(splits: Sequence[SplitFacts]) -> str:
     first = splits[0]
     return (
         "## How it was made\n\nAs configured, each level was searched for a way to the goal, and a PPO expert of its "
-        "own trained on it for at most the budget's env steps; the manifest's column `witness` says where each "
-        "solution came from. The manifests contain the whole configuration.\n\n" + "\n".join(rows) + "\n\n"
+        "own trained on it for at most the budget's env steps; the manifest's column `witness` (`source` in "
+        "seed files) says where each solution came from. The manifests contain the whole configuration.\n\n"
+        + "\n".join(rows)
+        + "\n\n"
         "To remake the levels and their experts, or to check every byte and every witness:\n\n"
         f"    levelproof regenerate manifest=data/{first.path} budget={first.budget} out=again\n"
         f"    levelproof verify data/{first.path}"

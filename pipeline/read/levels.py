@@ -13,7 +13,7 @@ import pyarrow as pa
 from levelproof.configs.convert import typed
 from levelproof.configs.schema import from_files
 from levelproof.levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
-from levelproof.levelgen.identity.keys import ALIKE_VERSIONS, SAMPLER_VERSION
+from levelproof.levelgen.identity.keys import ALIKE_VERSIONS, MAX_LEVEL_ID, SAMPLER_VERSION
 from levelproof.levelgen.level import Level, size_of
 from levelproof.levelgen.sampling.sampler import Distribution, sample_levels
 from levelproof.levelgen.task.rules import TaskParams
@@ -42,7 +42,7 @@ def find_level(split: Path, level_id: int) -> tuple[Manifest, dict[str, Any]]:
         UserError: the split or the level does not exist.
         Failure: a fragment is damaged.
     """
-    manifest = require_manifest(split, COLUMNS, [level_id])
+    manifest = require_manifest(split, COLUMNS, [level_id] if 0 <= level_id <= MAX_LEVEL_ID else [])
     if not manifest.table.num_rows:
         ids = require_manifest(split, []).level_ids
         raise UserError(

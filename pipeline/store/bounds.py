@@ -30,6 +30,7 @@ A_VALUE = 16  # bytes that a value takes besides those of its page
 UNSEEN = "content_hash"  # only compared, never printed, so its characters are not checked
 ARROW_SCHEMA = b"ARROW:schema"  # key of metadata
 WRITER = "parquet-cpp-arrow"  # from files of other writers, Arrow may read more than the footer says
+
 # What reading untrusted bytes can raise
 DAMAGE = (OSError, pa.ArrowException, LookupError, ValueError, TypeError, AttributeError, RuntimeError, MemoryError)
 READ_OPTIONS = {
@@ -38,6 +39,10 @@ READ_OPTIONS = {
     "thrift_string_size_limit": MAX_FOOTER,
     "thrift_container_size_limit": MAX_GROUPS,
 }
+
+
+class OtherKind(ValueError):
+    """The file has the columns of another kind."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,4 +249,7 @@ def with_dictionaries(kind: FileKind = FRAGMENTS) -> list[str]:
 
 
 def _open(source: pa.NativeFile, texts: list[str]) -> pq.ParquetFile:
-    return pq.ParquetFile(source, read_dictionary=texts, **READ_OPTIONS)
+    try:
+        return pq.ParquetFile(source, read_dictionary=texts, **READ_OPTIONS)
+    except KeyError as error:
+        raise OtherKind(f"it has no column {error.args[0]!r}") from None

@@ -1,7 +1,5 @@
 """Output folders that users name, which appear whole or not at all."""
 
-import os
-import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,7 +13,8 @@ def new_folder(out: Path, replaces: Callable[[Path], bool] = lambda _: False) ->
     """Yield a hidden folder beside `out`, which is renamed to `out` when the block ends.
 
     After an exception it is removed. A killed process leaves `out` as it was, and a hidden folder, which the next
-    process that writes `out` removes. An existing folder is replaced if `replaces` returns True for it.
+    process that writes `out` removes. An existing folder is replaced, by two renames, if `replaces` returns True for
+    it; a process that is killed just between them leaves no `out`.
 
     Raises:
         UserError: `out` exists and may not be replaced, or cannot be written.
@@ -24,14 +23,18 @@ def new_folder(out: Path, replaces: Callable[[Path], bool] = lambda _: False) ->
     if exists and (out.is_symlink() or not out.is_dir() or not replaces(out)):
         raise UserError(f"{out} already exists: name a new folder with -o, or remove that one.")
     whole = out.absolute()  # gives `gallery/` and `.` names
-    replaced = whole.with_name(f".{whole.name}.{os.getpid()}.old")
     try:
         whole.parent.mkdir(parents=True, exist_ok=True)
         with scratch(whole.parent, f".{whole.name}.unfinished-") as unfinished:
             yield unfinished
+            replaced = unfinished.with_name("replaced")  # removed with what else is left here
             if exists:
                 whole.rename(replaced)
-            unfinished.rename(whole)
-            shutil.rmtree(replaced, ignore_errors=True)
+            try:
+                unfinished.rename(whole)
+            except OSError:
+                if exists:
+                    replaced.rename(whole)
+                raise
     except OSError as error:
         raise UserError(f"Cannot write {out} ({error.strerror or error}): choose another folder with -o.") from None

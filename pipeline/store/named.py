@@ -1,10 +1,11 @@
 """The data that a manifest names: shards of a split, or seed files."""
 
 from collections.abc import Iterable
+from functools import lru_cache
 from pathlib import Path
 
 from levelproof.pipeline.store.layout import data_path
-from levelproof.pipeline.store.remote import is_remote
+from levelproof.pipeline.store.remote import RemoteFile, is_remote
 from levelproof.pipeline.store.seed.file import file_of, is_seed
 from levelproof.pipeline.store.seed.shard import SeedShard
 from levelproof.pipeline.store.shard import Shard, stored_bytes
@@ -16,11 +17,25 @@ def open_shard(split: Path, name: str, size: str) -> Shard:
     Raises:
         Failure: it is missing, damaged, of another size, or not in the split.
     """
-    return SeedShard(file_of(split, name), size) if is_seed(split) else Shard(data_path(split, name), size)
+    if not is_seed(split):
+        return Shard(data_path(split, name), size)
+    file = file_of(split, name)
+    about = None if is_remote(file) else file.stat()
+    return _seed_shard(file, size, about and (about.st_ino, about.st_size, about.st_mtime_ns))
 
 
 def bytes_named(split: Path, names: Iterable[str]) -> int:
     """Sum the bytes of the shards or seed files that a manifest names."""
     if not is_seed(split):
         return sum(stored_bytes(data_path(split, name)) for name in names)
-    return 0 if is_remote(split) else sum(file_of(split, name).stat().st_size for name in names)
+    return sum(map(_bytes_of, {file_of(split, name) for name in names}))
+
+
+@lru_cache(maxsize=2)
+def _seed_shard(file: Path, size: str, written: tuple[int, ...] | None) -> SeedShard:
+    """Open a seed file once until it is `written` again: exports read its rows a block at a time."""
+    return SeedShard(file, size)
+
+
+def _bytes_of(file: Path) -> int:
+    return RemoteFile(file).size if is_remote(file) else file.stat().st_size

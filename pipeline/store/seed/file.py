@@ -13,8 +13,8 @@ import pyarrow as pa
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.labels import WITNESSED, Label, Source
 from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
-from levelproof.pipeline.errors import Failure
-from levelproof.pipeline.store.bounds import DAMAGE, bounded
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.store.bounds import DAMAGE, OtherKind, bounded
 from levelproof.pipeline.store.formats import CONFIG_KEY, HASH_KEY
 from levelproof.pipeline.store.fragment import Fragment, settings_in
 from levelproof.pipeline.store.layout import MANIFEST
@@ -31,6 +31,7 @@ from levelproof.pipeline.store.seed.packed import MAX_BYTES
 
 SUFFIX = ".parquet"
 STORED = "density=seed"
+OPENED = "name a split, or what `levelproof export SPLIT --format seed` has written"
 BUDGET = r"[A-Za-z0-9._]{1,32}"
 
 
@@ -68,7 +69,8 @@ def read_seed(
     """Read columns of a seed file, of all rows or, with `level_ids` (ascending), of these levels' row groups at least.
 
     Raises:
-        Failure: it is missing, damaged, no seed file, or has another version.
+        UserError: it is no seed file.
+        Failure: it is missing, damaged, or has another version.
     """
     try:
         with bounded(path, SEEDS) as file:
@@ -95,6 +97,9 @@ def read_seed(
         raise Failure(f"There is no seed file {path}: `levelproof export SPLIT --format seed` writes one.") from None
     except PermissionError:
         raise Failure(f"The seed file {path} cannot be read: check its permissions.") from None
+    except OtherKind:
+        whole = f"open the whole split, {path.parent.parent}" if path.parent.name == MANIFEST else OPENED
+        raise UserError(f"The file {path} is parquet, but not a seed file: {whole}.") from None
     except DAMAGE as error:
         raise damaged_seed(path, error) from error
     return SeedFile(fragment, budget, tuple(content)), table

@@ -110,6 +110,10 @@ def test_invalid_command_prints_the_usage(capsys: pytest.CaptureFixture[str], ar
     [
         (["generate", "--size", "m"], "There is no option --size: write settings as NAME=VALUE, as in size=m"),
         (["inspect", "x", "--were", "a"], "There is no option --were: --help lists the options"),
+        (["show", "x", "-o", "y.svg", "z"], "There is no argument z: --help lists them"),
+        (["inspect", "x", "--csv", "--against", "y"], "--against has no effect with --csv: leave one of them out"),
+        (["inspect", "x", "--plot", "y.svg", "--limit", "3"], "--limit has no effect with --plot"),
+        (["export", "x", "--format", "seed"], "name the file to write with -o, as in -o levels.parquet"),
         (["generate", "out=gcs://bucket/x"], "gcs:/bucket/x/128k/s looks like a URL"),
         (["status", "ftp://host/split"], "ftp:/host/split looks like a URL"),
         (["show", "x", "7", "-o", "s3://bucket/level.gif"], "This command cannot write to s3://bucket/level.gif"),
@@ -119,6 +123,25 @@ def test_invalid_command_prints_the_usage(capsys: pytest.CaptureFixture[str], ar
 def test_unknown_options_and_urls_are_not_taken_for_folders(tmp_path: Path, arguments: list[str], message: str) -> None:
     assert_refused(here(arguments, tmp_path), 2, message)
     assert not list(tmp_path.iterdir())
+
+
+def test_arguments_may_follow_options(split: Path) -> None:
+    """argparse leaves over those that are optional."""
+    done = here(["export", "data/5k/s", "-o", "level.json", str(solved_level(split))], split.parents[2])
+    assert done.returncode == 0, done.stderr
+    done = here(["plan", "size=s", "--json", "levels=6M"], split.parents[2])
+    assert json.loads(done.stdout)["levels"] == 6_000_000
+
+
+def test_parts_of_a_split_and_impossible_ids_are_named(split: Path) -> None:
+    done = here(["inspect", "data/5k/s/manifest"], split.parents[2])
+    assert_refused(done, 2, "is parquet, but not a seed file: open the whole split, data/5k/s")
+    done = here(["show", "data/5k/s", "9" * 20], split.parents[2])
+    assert_refused(done, 2, f"There is no level {'9' * 20} in data/5k/s")
+    done = here(
+        ["inspect", "data/5k/s", "--csv", "--columns", "label,level_id,label", "--limit", "1"], split.parents[2]
+    )
+    assert done.stdout.splitlines()[0] == "label,level_id"
 
 
 def test_inspect_rejects_a_folder_of_splits(made: Path) -> None:

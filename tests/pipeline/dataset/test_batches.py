@@ -123,3 +123,8 @@ def test_batches_use_bounded_memory(data: Dataset) -> None:
         if number % 100 == 0:
             sizes.append(resident())
     assert sizes[-1] < 1.1 * max(sizes[:5])
+
+
+def test_negative_epochs_are_refused(data: Dataset) -> None:
+    with pytest.raises(UserError, match="epochs is -1: it must be at least 0, or None for endless batches"):
+        data.batches(8, epochs=-1)

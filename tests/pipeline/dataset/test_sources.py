@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from levelproof.pipeline.dataset.dataset import Dataset
+from levelproof.pipeline.dataset.sample import sample_data
 from levelproof.pipeline.errors import UserError
 
 
@@ -45,6 +46,22 @@ def test_forked_process_reads_but_computes_no_observations(data: Dataset) -> Non
             observing[0]
         except UserError as error:
             os._exit(7 if "multiprocessing_context='spawn'" in str(error) else 1)
+        finally:
+            os._exit(2)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+@pytest.mark.filterwarnings("ignore:.*fork")
+def test_forked_process_simulates_no_records() -> None:
+    """Those of seeds are simulated whatever is asked for."""
+    plain = sample_data().grain(observation=None)
+    child = os.fork()
+    if not child:
+        try:
+            plain[0]
+        except UserError as error:
+            os._exit(7 if "cannot simulate records" in str(error) else 1)
         finally:
             os._exit(2)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7

@@ -3,6 +3,7 @@
 import io
 import re
 from pathlib import Path
+from shutil import copyfile
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from PIL import Image
 
 from levelproof.experts.labels import Label
 from levelproof.pipeline.cli.main import main
+from levelproof.pipeline.dataset.sample import SAMPLE
 from levelproof.pipeline.look import card as cards
 from levelproof.pipeline.look.figures import Share
 from levelproof.pipeline.look.preview import PICTURES, PIXELS, SHOWN
@@ -52,6 +54,26 @@ def test_header_lists_preview_and_manifests(dataset: Path) -> None:
             assert files
             assert all(pq.read_metadata(file).num_rows for file in files)
     assert len(list(dataset.glob(others[1]["data_files"][0]["path"]))) == 2
+
+
+@pytest.mark.slow
+def test_card_of_seed_files_names_what_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "256k/8-8").mkdir(parents=True)
+    seeds = tmp_path / "256k/8-8/part-000.parquet"
+    copyfile(SAMPLE, seeds)
+    monkeypatch.setattr(cards, "SAMPLE", 4)
+    assert main(["card", str(seeds.parent)]) == 0
+    text, header = (tmp_path / "README.md").read_text(), header_of(tmp_path / "README.md")
+    for config in header["configs"]:
+        for entry in config["data_files"]:
+            assert re.fullmatch(r"\w+", entry["split"])
+            assert [*tmp_path.glob(entry["path"])], entry
+    assert ".zarr" not in text
+    steps = np.nansum(read_manifest(seeds).table["steps_to_goal"].to_numpy())
+    assert f"| {steps:,.0f} |" in text, "repetitions are not counted"
+    assert f" {seeds.stat().st_size / steps:.1f} |" in text
+    assert main(["card", str(seeds)]) == 0
+    assert header_of(seeds.with_name("README.md"))["configs"][1]["data_files"][0]["path"] == seeds.name
 
 
 def test_preview_has_pictures_in_the_hubs_format(dataset: Path) -> None:
@@ -112,7 +134,10 @@ def test_card_overwrites_only_cards(dataset: Path, tmp_path: Path, capsys, monke
 
 @pytest.mark.parametrize(("witnesses", "words"), [(0, "n<1K"), (3, "n<1K"), (4, "1K<n<10K"), (6 * 10**6, "1B<n<10B")])
 def test_size_category_counts_transitions(witnesses: int, words: str) -> None:
-    facts = SplitFacts("1M/s", {"solved": witnesses}, witnesses, witnesses, np.arange(0), 0, 0, "1M", "", "", "", [])
+    facts = SplitFacts(
+        "1M/s", False, "", {"solved": witnesses}, witnesses, witnesses, 256 * witnesses, np.arange(0), 0, 0, "1M", "",
+        "", "", [],
+    )  # fmt: skip
     header = readme("name", [facts], CardOptions(), [], "0.1.0").split("---\n")[1]
     assert yaml.safe_load(header)["size_categories"] == [words]
 

@@ -9,6 +9,7 @@ from scipy.stats import binomtest
 
 from levelproof.experts.labels import Label
 from levelproof.experts.ledger import Ledger
+from levelproof.pipeline.dataset.sample import SAMPLE
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import commit
@@ -63,6 +64,13 @@ def test_compare_prices_each_extra_solved_level(splits: tuple[Path, Path]) -> No
     assert facts["seconds_for_one_more"] == pytest.approx(-14, abs=1)  # plus the time of writing
     assert facts["steps_to_goal"]["shorter"] == facts["steps_to_goal"]["levels"] == 2
     assert facts["steps_to_goal"]["median_change"] == -1
+
+
+@pytest.mark.slow
+def test_costs_that_seeds_leave_behind_are_not_zero(capsys: pytest.CaptureFixture[str]) -> None:
+    diff(SAMPLE, SAMPLE, "level_id < 20", 1, as_json=False)
+    assert "env steps" not in capsys.readouterr().out
+    assert compare(SAMPLE, SAMPLE, "level_id < 20")["env_steps"] == [None, None]
 
 
 @pytest.mark.parametrize(("one", "other"), [(0, 0), (0, 5), (3, 9), (40, 40), (812, 900), (0, 4000)])

@@ -1,5 +1,6 @@
 """Temporary folders of killed processes are removed, and those of live ones stay."""
 
+import errno
 import json
 import os
 import socket
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.store import machine
 from levelproof.pipeline.store import scratch as module
 from levelproof.pipeline.store.created import new_folder
@@ -167,3 +169,20 @@ def test_concurrent_processes_keep_their_own_folders(parent: Path) -> None:
         for done in threads.map(crowd, range(4)):
             assert done.returncode == 0, done.stderr
     assert not [*parent.iterdir()]
+
+
+def test_new_folder_restores_what_it_could_not_replace(parent: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = parent / "out"
+    (out / "old").mkdir(parents=True)
+    rename = Path.rename
+
+    def failing(self: Path, target: Path) -> Path:
+        if self.name == "files":
+            raise OSError(errno.EIO, "broken")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(UserError, match="Cannot write"), new_folder(out, lambda _: True) as folder:
+        (folder / "new").mkdir()
+    assert [*parent.iterdir()] == [out]
+    assert (out / "old").is_dir()
