@@ -60,16 +60,22 @@ def evaluated(args: argparse.Namespace, policy: str, on: str, size: str) -> dict
         some = ("--levels", args.levels) if args.levels else ()
         file.write_text(command("evaluate", policy, "--on", on, "--size", size, *some, "--json"))
     (group,) = json.loads(file.read_text())["levels"]
-    origin = load_policy(policy).origin
-    steps = f"{origin['env_steps']:,}, {origin['levels']['levels']}" if "env_steps" in origin else "none"
-    facts = {"policy": policy, "on": on, "size": size, "env_steps": steps}
+    steps = [f"{each['env_steps']:,}, {each['levels']['levels']}" for each in history(policy) if "env_steps" in each]
+    facts = {"policy": policy, "on": on, "size": size, "env_steps": "; ".join(steps) or "none"}
     return facts | {"rates": group["of"][ALL], "published": group["published"], "levels": levels_of(group)}
 
 
 def demonstrated(policy: str) -> int:
-    """Return how many levels' witnesses a policy, or the one that its training started from, was cloned from."""
-    origin = load_policy(policy).origin
-    return sum(split["levels"] for split in origin.get("start_origin", origin).get("splits", []))
+    """Return how many levels' witnesses a policy, or one that its training started from, was cloned from."""
+    return sum(split["levels"] for origin in history(policy) for split in origin.get("splits", []))
+
+
+def history(policy: str) -> list[dict[str, Any]]:
+    """Return the origins of the policies that training started from, the first one first, and of this policy."""
+    origins = [dict(load_policy(policy).origin)]
+    while "start_origin" in origins[0]:
+        origins.insert(0, origins[0]["start_origin"])
+    return origins
 
 
 def levels_of(group: dict[str, Any]) -> int:

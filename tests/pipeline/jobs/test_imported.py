@@ -15,6 +15,7 @@ from levelproof.levelgen.identity.content import content_hashes
 from levelproof.pipeline.jobs import imported as module
 from levelproof.pipeline.look.status import read_status
 from levelproof.pipeline.read.rows import read_rows
+from levelproof.pipeline.store import seal
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.verify.verify import examine
 from tests.pipeline.command import assert_refused, here
@@ -197,6 +198,23 @@ def test_import_reports_and_skips_invalid_records(once: Path, tmp_path: Path) ->
     assert read_status(tmp_path / "data/1M/s")["wanted"] == ROWS - 4
     want = [rows_of(once / "data/1M/s")[i]["content_hash"] for i in (0, 5, 6)]
     assert [row["content_hash"] for row in rows_of(tmp_path / "data/1M/s")] == want
+
+
+def test_unit_without_a_usable_record_does_not_stop_sealing(
+    once: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = module.read_trajectories
+
+    def spoilt(array, first, last):
+        trajectories = read(array, first, last)
+        return trajectories._replace(wrong=["spoilt"] * (last - first)) if array.path.name == "first" else trajectories
+
+    monkeypatch.setattr(module, "read_trajectories", spoilt)
+    monkeypatch.setattr(seal, "ROWS", 2)
+    done = here(["import", str(once / "theirs"), "-o", "data/1M/s"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "Not sealed" not in done.stderr
+    assert len(rows_of(tmp_path / "data/1M/s")) == ROWS - ROWS // 2
 
 
 def test_import_requires_a_split_named_by_budget_and_size(once: Path, tmp_path: Path) -> None:
