@@ -70,7 +70,7 @@ def play_episodes(
 
     Args:
         level: levels, level axis last.
-        action: the actions.
+        action: the actions, of any integer type.
         steps: lengths of the episodes, env steps, 1 to 256.
         rules: the task's rules.
         fields: paths of `Record` to return; anything else is not kept.
@@ -121,6 +121,7 @@ def _play_block(
     observation: ObservationType | None,
 ) -> _PlayedBlock:
     with_contacts = any(name.startswith("manifold/") for name in fields)
+    action = action.astype(jnp.int32)
 
     def row(now: TaskState, manifold: Any, taken: Array, outcome: Any) -> Any:
         made = paths_of(record_of(level, now, manifold, taken, outcome))

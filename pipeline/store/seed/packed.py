@@ -69,7 +69,7 @@ def unpack_witnesses(packed: Sequence[bytes], steps: Int[np.ndarray, " level"]) 
     if (change >= choices[part]).any():
         raise ValueError("its witnesses have actions that their entries do not have")
     value = (total - before[part]) % choices[part]
-    action = np.zeros((RECORD_STEPS, ENTRIES, count), np.int32)
+    action = np.zeros((RECORD_STEPS, ENTRIES, count), np.int8)
     flat = np.repeat(value, length)
     ends = np.cumsum(length)
     offset = np.concatenate([[0], ends[last][:-1]])[: len(entry)]
