@@ -215,11 +215,14 @@ def compose_clone(overrides: Sequence[str]) -> "CloneConfig":
     """Return the settings of `levelproof clone` that `overrides` (`key=value` strings) change.
 
     Raises:
-        ConfigError: a setting is unknown or has a wrong value.
+        ConfigError: a setting is unknown, has a wrong value, or has no effect beside the others.
     """
     from levelproof.configs.clone import CloneConfig  # imports flax and optax, which jobs do not need
 
-    return _changed(CloneConfig, map(_parse, overrides))
+    parsed = [_parse(text) for text in overrides]
+    config = _changed(CloneConfig, parsed)
+    _require_heads(config.network.kind, parsed)
+    return config
 
 
 def compose_train(overrides: Sequence[str]) -> "TrainConfig":
@@ -247,6 +250,7 @@ def compose_train(overrides: Sequence[str]) -> "TrainConfig":
         if name == "ppo.kl_updates" and not config.ppo.kl_weight:
             raise ConfigError(f"{name} has no effect without ppo.kl_weight: leave it out.")
     _require_no_network(config.start, parsed)
+    _require_heads(config.network.kind, parsed)
     if random and config.distribution not in distributions():
         hint = suggestion(config.distribution, distributions())
         raise ConfigError(f"there is no distribution {config.distribution}{hint}.")
@@ -264,6 +268,7 @@ def compose_distill(overrides: Sequence[str]) -> "DistillConfig":
     parsed = [_parse(text) for text in overrides]
     config = _changed(DistillConfig, parsed)
     _require_no_network(config.start, parsed)
+    _require_heads(config.network.kind, parsed)
     return config
 
 
@@ -272,6 +277,12 @@ def _require_no_network(start: str, overrides: Iterable[Override]) -> None:
     for override in overrides if start else ():
         if (name := override.key_or_group).startswith("network."):
             raise ConfigError(f"{name} cannot change the network of the policy in start: leave out {name} or start.")
+
+
+def _require_heads(kind: str, overrides: Iterable[Override]) -> None:
+    """Raise ConfigError if settings give heads to a network without attention."""
+    if kind not in ("attention", "transformer") and any(each.key_or_group == "network.heads" for each in overrides):
+        raise ConfigError(f"network.heads has no effect with network.kind={kind}: leave it out.")
 
 
 def _changed(cls: type[T], overrides: Iterable[Override]) -> T:

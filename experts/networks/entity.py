@@ -90,13 +90,14 @@ class EntityTrunk(nn.Module):
     encoding: int
     outputs: int
     gain: float
+    any_size: bool = False  # whether to have parameters for kinds that the size has no entities of, too
 
     @nn.compact
     def __call__(self, constant: Constant, moving: list[Float[Array, "moving entity lane"]]) -> Array:
         averages = [
             Encoder(self.encoding, kind, name=kind.name)(entities, of_kind)
             for kind, entities, of_kind in zip(KINDS, constant, moving, strict=True)
-            if entities.weight.size
+            if entities.weight.size or self.any_size
         ]
         x = jnp.concatenate(averages)
         for _ in range(self.depth - 1):

@@ -140,7 +140,7 @@ def _module(config: NetworkConfig, size: Size) -> nn.Module:
         case PolicyKind.FLAT:
             return FlatTrunk(size, *shape, LOGITS, POLICY_GAIN)
         case PolicyKind.INVARIANT:
-            return EntityTrunk(*shape, config.width, LOGITS, POLICY_GAIN)
+            return EntityTrunk(*shape, config.width, LOGITS, POLICY_GAIN, any_size=True)
     return AttentionPolicy(*shape, config.heads)
 
 

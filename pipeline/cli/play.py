@@ -14,7 +14,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     source = "folder of a split, or a level file, such as level.json (default: an empty level)"
     parser.add_argument("source", type=Path, nargs="?", metavar="SOURCE", help=source)
     parser.add_argument("level_id", type=int, nargs="?", metavar="LEVEL_ID", help="id of a level of the split")
-    parser.add_argument("--size", default="m", help="size of an empty level (default: m)")
+    parser.add_argument("--size", help="size of an empty level (default: m)")
     parser.add_argument("--budget", default="256k", help="env steps of an expert (default: 256k)")
     policy = "folder of a policy that the page lets play (default: builtin:s, which comes with levelproof)"
     parser.add_argument("--policy", type=Path, default=Path("builtin:s"), metavar="POLICY", help=policy)

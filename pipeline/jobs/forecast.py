@@ -43,6 +43,7 @@ class Sample:
     witnessed: Bool[np.ndarray, " level"]
     row_bytes: float  # bytes of a manifest row
     stored: dict[str, PerWitness]  # by density
+    expert_bytes: float = 0.0  # bytes of kept experts, per level
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,8 @@ def forecast(sample: Sample, levels: int, workers: int, untimed: int, unit: int 
         (busy + workers * sample.once) / max(sample.solved.mean() * levels, 1.0),
     )
     witnesses = sample.witnessed.mean() * levels
-    rows = levels * sample.row_bytes
+    rows = levels * (sample.row_bytes + sample.expert_bytes)
+    archives = math.ceil(levels / unit) if sample.expert_bytes else 0
     return Forecast(
         levels,
         workers,
@@ -120,7 +122,7 @@ def forecast(sample: Sample, levels: int, workers: int, untimed: int, unit: int 
             density: _estimate(witnessed * size.bytes + rows, witnesses * size.bytes + rows)
             for density, size in sample.stored.items()
         },
-        {density: _files(levels, witnesses, size) for density, size in sample.stored.items()},
+        {density: _files(levels, witnesses, size) + archives for density, size in sample.stored.items()},
     )
 
 

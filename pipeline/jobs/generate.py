@@ -203,10 +203,12 @@ def _spent(manifest: Manifest, made: np.ndarray, spent: EnvSteps) -> str:
     """Return a sentence on how this run's env steps were used."""
     rows = manifest.table.filter(np.isin(manifest.level_ids, made))
     steps, label = (rows.column(name).to_numpy() for name in ("env_steps", "label"))
+    solved, unsolved = (steps[label == kind].sum() for kind in (Label.SOLVED, Label.UNSOLVED))
+    trained = spent.trained / max(solved + unsolved, 1)  # rows of continued experts count earlier runs, too
     shares = {
         "in searches": spent.searched,
-        "in training on solved levels": steps[label == Label.SOLVED].sum(),
-        "in training on unsolved levels": steps[label == Label.UNSOLVED].sum(),
+        "in training on solved levels": solved * trained,
+        "in training on unsolved levels": unsolved * trained,
         "in evaluations": spent.evaluated,
         "in empty slots": spent.idle,
         "in replays of witnesses": spent.replayed,

@@ -26,7 +26,7 @@ from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.runtime import own_cores, prepare_jax
 from levelproof.pipeline.store.event_files import events_of, runs_in
 from levelproof.pipeline.store.formats import Encoding
-from levelproof.pipeline.store.layout import split_path
+from levelproof.pipeline.store.layout import EXPERTS, split_path
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.scratch import scratch
 from levelproof.pipeline.store.shard import stored_bytes, write_shard
@@ -112,6 +112,7 @@ def measure(job: JobConfig, console: Console, seconds: float = SECONDS) -> Sampl
             witnessed=np.isin(labels, [label.value for label in WITNESSED]),
             row_bytes=_row_bytes(table),
             stored=_stored(job, split, table, folder),
+            expert_bytes=sum(file.stat().st_size for file in (split / EXPERTS).glob("*.npz")) / table.num_rows,
         )
 
 

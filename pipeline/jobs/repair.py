@@ -44,12 +44,14 @@ def repair(split: Path, settings: Sequence[str], console: Console) -> Exit:
 
     Raises:
         UserError: there is no split, it was imported, another command writes to it, or a setting is not in SETTINGS.
+        ConfigError: a setting has a wrong value.
         Failure: it was made with settings that this program does not accept, or a write failed.
     """
     if wrong := [setting for setting in settings if setting.partition("=")[0] not in SETTINGS]:
         raise UserError(
             f"A repair uses the settings of its split: leave out {wrong[0]}; {', '.join(SETTINGS)} may change."
         )
+    compose_job(settings)  # raises ConfigError for the user's own mistakes, before anything takes time
     findings = _examine_split(split, inline="executor=inline" in settings)
     print(findings.report(split))
     if not findings.wrong:

@@ -151,11 +151,10 @@ def train(
             jax.block_until_ready(likeness)
             if update == first + 1:
                 began = time.monotonic()  # reading and compiling do not count
-            rate = (update - first - 1) / max(time.monotonic() - began - aside, 1e-9)
-            pace = (
-                f"{rate * config.train.batch:,.0f} samples/s · about {duration((last - update) / max(rate, 1e-9))} left"
-            )
-            show(1, f"{update:,}/{last:,} updates · {pace}")
+            rate, pace = (update - first - 1) / max(time.monotonic() - began - aside, 1e-9), ""
+            if rate:
+                pace = f" · {rate * config.train.batch:,.0f} samples/s · about {duration((last - update) / rate)} left"
+            show(1, f"{update:,}/{last:,} updates{pace}")
             if update % config.interval == 0 or update == last:
                 paused = time.monotonic()
                 numbers = {COURSE.step: update, "bc/samples_per_second": rate * config.train.batch}
@@ -165,7 +164,7 @@ def train(
                 recent = []
                 metrics.write(numbers)  # before the checkpoint: a run that continues drops lines after it
                 save(state)
-                say(console, f"{line_of(update, last, numbers)} · {pace}")
+                say(console, f"{line_of(update, last, numbers)}{pace}")
                 aside += time.monotonic() - paused
     return state
 

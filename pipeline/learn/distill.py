@@ -222,7 +222,7 @@ def update_until_done(
             if not now.labels.filled and not config.witnesses:
                 raise UserError(
                     f"No teacher reached the goal from any of {config.states} states: set witnesses above 0, or raise "
-                    "states or teachers.random."
+                    "states or teachers.random, and choose another folder with -o."
                 )
             until = min(update + config.interval, last)
             now, recent = learn(taught, config, network, now, until)

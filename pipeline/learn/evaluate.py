@@ -22,7 +22,7 @@ from levelproof.experts.evaluation import (
     play_sampled,
     play_sticky,
 )
-from levelproof.experts.networks.saved import Policy
+from levelproof.experts.networks.saved import BUILTIN, Policy
 from levelproof.levelgen.level import SIZES, name_of
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs.progress import say
@@ -92,6 +92,8 @@ def evaluate(
         log, name = (policy.with_suffix(f".{LOOKS}"), AGENT) if agent else (policy / LOOKS, SAMPLED)
         if looks := log_look(log, name, facts, attempts, seed):
             say(console, f"Look {looks} at the sealed levels; {log} lists all of this policy.")
+        elif not str(policy).startswith(BUILTIN):  # others cannot know of these looks
+            say(console, f"Cannot write {log}: note yourself that this was a look at the sealed levels.")
     if as_json:
         json.dump({"policy": policy and str(policy), "attempts": attempts, "seed": seed, "levels": facts}, sys.stdout)
         print()

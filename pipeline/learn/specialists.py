@@ -51,7 +51,7 @@ def specialists_of(split: Path, level_ids: Int[np.ndarray, " level"], attempts: 
         )
     own = config.get("expert", {}).get("attempts", ATTEMPTS)
     solved = _drawn(successes_of(rows, own), own, attempts)
-    return Specialists(_named(rows["budget"][0].as_py()), solved)
+    return Specialists(_named(rows["budget"][0].as_py(), solved, attempts), solved)
 
 
 def sealed_specialists(size: str, count: int, attempts: int) -> list[Specialists]:
@@ -61,7 +61,8 @@ def sealed_specialists(size: str, count: int, attempts: int) -> list[Specialists
     """
     known = known_sealed(size)
     successes = known.successes if known else {}
-    return [Specialists(_named(name), _drawn(each[:count], ATTEMPTS, attempts)) for name, each in successes.items()]
+    solved = {name: _drawn(each[:count], ATTEMPTS, attempts) for name, each in successes.items()}
+    return [Specialists(_named(name, each, attempts), each) for name, each in solved.items()]
 
 
 def successes_of(rows: pa.Table, attempts: int) -> Int[np.ndarray, " level"]:
@@ -71,8 +72,10 @@ def successes_of(rows: pa.Table, attempts: int) -> Int[np.ndarray, " level"]:
     return np.round(rates * attempts).astype(np.int64)
 
 
-def _named(budget: str) -> str:
-    return f"its own expert, {budget}"
+def _named(budget: str, solved: Solved, attempts: int) -> str:
+    """Name a row; if it has fewer attempts than its table, say how many."""
+    own = solved.shape[1]
+    return f"its own expert, {budget}{f', {own} attempts' if own < attempts else ''}"
 
 
 def _drawn(successes: Int[np.ndarray, " level"], own: int, attempts: int) -> Solved:

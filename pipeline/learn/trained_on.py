@@ -46,10 +46,21 @@ def levels_for(config: TrainConfig, tell: Callable[[str], None]) -> TrainingLeve
     usable = without_sealed(place, hashes, groups[0].levels.size, tell)
     require_some_usable(place, usable)
     parts = [take(group.levels, np.flatnonzero(usable)) for group in groups]
+    _require_enough(config, sum(map(len, parts)))
     levels = jax.device_put(jax.tree.map(lambda *xs: np.concatenate(xs, -1), *parts))
     digest = hashlib.sha256("".join(hashes[usable]).encode()).hexdigest()[:16]
     facts = {"levels": str(place), "count": len(parts[0]), "content": digest}
     return TrainingLevels(str(place), levels, groups[0].rules, facts)
+
+
+def _require_enough(config: TrainConfig, starts: int) -> None:
+    """Raise UserError if there are fewer levels, each start of one counted, than replay waits for."""
+    needed = config.replay.full_enough * config.replay.capacity
+    if config.choice == "replay" and starts < needed:
+        raise UserError(
+            f"choice=replay starts once {needed:,.0f} levels have been attempted (replay.full_enough times "
+            f"replay.capacity), but {config.levels} gives {starts:,}: set a smaller replay.capacity."
+        )
 
 
 def _groups(config: TrainConfig, tell: Callable[[str], None]) -> list[MeasuredLevels]:
@@ -59,6 +70,8 @@ def _groups(config: TrainConfig, tell: Callable[[str], None]) -> list[MeasuredLe
         return [midway_levels(place, where, None, share / config.starts) for share in range(config.starts)]
     if config.starts > 1:
         raise UserError(f"starts={config.starts} needs witnesses, but {place} is not a split: leave it out.")
+    if not is_split(place) and config.where != TrainConfig.where:
+        raise UserError(f"where={config.where} selects levels of a split, but {place} is not a split: leave it out.")
     groups = list(levels_in(place, where if is_split(place) else None, None, tell))
     if len(groups) > 1:
         sizes = ", ".join(name_of(group.levels.size) for group in groups)

@@ -24,7 +24,7 @@ from levelproof.pipeline.runtime import prepare_jax
 
 
 def play(
-    source: Path | None, level_id: int | None, size: str, budget: str, port: int, browser: bool, policy: Path
+    source: Path | None, level_id: int | None, size: str | None, budget: str, port: int, browser: bool, policy: Path
 ) -> None:
     """Serve the page until Ctrl-C, and open it if `browser`; the page lets the policy in the folder `policy` play.
 
@@ -52,10 +52,12 @@ def play(
             print("Done. Files that you saved are in your browser's downloads.")
 
 
-def level_to_play(source: Path | None, level_id: int | None, size: str) -> tuple[LevelFile, np.ndarray | None]:
+def level_to_play(source: Path | None, level_id: int | None, size: str | None) -> tuple[LevelFile, np.ndarray | None]:
     """Load the level to play with its rules, and the actions [step, 6] of its witness or None."""
     if source is None:
-        return empty_file(size), None
+        return empty_file(size or "m"), None
+    if size is not None:
+        raise UserError(f"--size is for an empty level: leave it out, or {source}.")
     if is_level_file(source):
         file = level_file(source, level_id)
         return file, witness_in(json.loads(source.read_bytes()), file)

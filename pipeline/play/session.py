@@ -15,6 +15,7 @@ from levelproof.levelgen.edit import EDITS, EditError, bodies_at, one_of
 from levelproof.levelgen.files.entries import LevelFileError
 from levelproof.levelgen.files.level_file import LevelFile, from_document, to_document
 from levelproof.levelgen.level import ACTIONS, SIZES, Level, Role, name_of, size_of
+from levelproof.levelgen.sampling.sampler import check_size
 from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import CHOICES
@@ -257,9 +258,10 @@ def empty_file(size: str) -> LevelFile:
     """An empty level of a size, with the default rules.
 
     Raises:
-        UserError: no such size.
+        UserError: no such size, or one without room for a goal.
     """
     try:
+        check_size(size_of(size))
         return LevelFile(empty_level(size_of(size), 1), TaskParams())
     except ValueError as error:
         raise UserError(f"{error}.") from None

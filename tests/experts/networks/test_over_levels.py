@@ -12,7 +12,7 @@ import pytest
 import levelproof
 from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy, policy_logits
 from levelproof.experts.networks.saved import CONFIG, WEIGHTS, Policy
-from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.level import SIZES, Level, size_of
 from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.rules import reset
 from tests.experts.networks.weights import random_weights
@@ -75,6 +75,18 @@ def test_attention_plays_any_size_and_idle_entries_are_zero(size: str) -> None:
     for action in both(jax.random.key(0)):
         assert action.shape == (6, COUNT)
         assert not np.asarray(action)[~np.asarray(action_mask(levels))].any()
+
+
+@pytest.mark.parametrize("kind", sorted(set(PolicyKind) - {PolicyKind.FLAT}))
+def test_parameters_do_not_depend_on_the_size(kind: PolicyKind) -> None:
+    """Also where a size has no entity of some kinds, so that policies trained there load, and play elsewhere."""
+    network = NetworkConfig(kind, width=16, depth=1)
+    bare = size_of("7-0-2-0")
+    of = lambda size: jax.eval_shape(lambda: initial_policy(jax.random.key(0), network, size))
+    assert of(bare) == of(SIZES["m"])
+    levels = levelproof.sample_levels(np.arange(2), bare)
+    params = jit_once(initial_policy, static_argnums=(1, 2))(jax.random.key(0), network, SIZES["m"])
+    assert np.isfinite(logits_of(params, network, levels)).all()
 
 
 def test_transformer_has_the_shape_of_the_reference() -> None:

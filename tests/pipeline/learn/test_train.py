@@ -255,6 +255,11 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (["choice=learnability"], "choice has no effect on random levels"),
         (["levels=some/split", "curriculum.keep=4"], "no effect with choice=uniform"),
         (["levels=some/split", "choice=evolve"], "choice"),
+        (
+            ["levels=file", "where=level_id < 9"],
+            "where=level_id < 9 selects levels of a split, but file is not a split",
+        ),
+        (["network.kind=flat", "network.heads=8"], "network.heads has no effect with network.kind=flat"),
         (["levels=replay", "replay.share=1"], "share is 1"),
         (["levels=replay", "evolve.edits=4"], "no effect with levels=replay"),
         (["levels=evolve", "replay.capacity=4"], "evolve.children is 64: it must not exceed 2"),
@@ -278,6 +283,13 @@ def test_bad_input_is_refused_in_one_sentence(words: list[str], sentence: str, t
 def test_folder_of_another_run_is_refused(agent: Path, easy: tuple[str, ...], tmp_path: Path) -> None:
     shutil.copytree(agent, tmp_path / "agent")
     assert_refused(here(["train", *LANES, *easy, "seed=1"], tmp_path), 2, "has a run with other settings or levels")
+
+
+def test_replay_of_too_few_levels_is_refused(split: Path, tmp_path: Path) -> None:
+    done = here(["train", f"levels={split}", "choice=replay", *LANES, *TINY], tmp_path)
+    assert_refused(
+        done, 2, "choice=replay starts once 2,000 levels have been attempted", "set a smaller replay.capacity"
+    )
 
 
 @pytest.mark.parametrize(
