@@ -1,7 +1,8 @@
 """Temporary folders, each locked by its process; later processes remove unlocked ones, which killed processes left.
 
-A folder has a lock file, which names its machine, and `files` for its owner. Only folders of this user and this machine
-are removed: on a shared file system, locks may be valid on one machine alone.
+A folder has a lock file, which names its machine, and `files` for its owner; what else lies there is removed with it.
+Only folders of this user and this machine are removed: on a shared file system, locks may be valid on one machine
+alone.
 """
 
 import fcntl
@@ -104,9 +105,11 @@ def _sweep(folder: Path) -> None:
 
 def _remove(folder: Path) -> None:
     """Remove a folder whose lock is held. If files remain, the lock file does too, so that a later sweep finds it."""
-    shutil.rmtree(folder / FILES, ignore_errors=True)
     with suppress(OSError):
-        if not (folder / FILES).exists():
+        for entry in folder.iterdir():
+            if entry.name != LOCK:
+                shutil.rmtree(entry, ignore_errors=True)
+        if {entry.name for entry in folder.iterdir()} <= {LOCK}:
             (folder / LOCK).unlink(missing_ok=True)
             folder.rmdir()
 

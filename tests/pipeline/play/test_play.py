@@ -43,7 +43,7 @@ def address(split: Path) -> Iterator[str]:
     """Address of a server whose level has a witness."""
     rows = require_manifest(split).table.to_pylist()
     solved = next(row for row in rows if row["shard"])
-    file, actions = level_to_play(split, solved["level_id"], "m")
+    file, actions = level_to_play(split, solved["level_id"], None)
     with serving(file, actions, QUICK, 20_000, 0) as server:
         yield f"http://{HOST}:{server.socket.getsockname()[1]}"
 
@@ -85,7 +85,7 @@ def test_save_writes_a_level_file_with_its_witness(page: ClientConnection, tmp_p
     document = ask(page, "save")["document"]
     path = tmp_path / "witness.json"
     path.write_text(json.dumps(document))
-    file, actions = level_to_play(path, None, "m")
+    file, actions = level_to_play(path, None, None)
     assert actions is not None
     assert actions.tolist() == document["witness"]["actions"]
     padded = np.zeros((RECORD_STEPS, 6, 1), int)
@@ -139,7 +139,7 @@ def test_train_request_streams_progress(page: ClientConnection, monkeypatch: pyt
 def test_policy_attempts_are_played_from_the_start(split: Path) -> None:
     """Another attempt each time; a success is the level's witness, as if the user had played it."""
     row = next(row for row in require_manifest(split).table.to_pylist() if row["shard"])
-    file, _ = level_to_play(split, row["level_id"], "m")
+    file, _ = level_to_play(split, row["level_id"], None)
     session = Session(file, None, Contender(random_policy(None), 1))
     assert session.level({})["policy"]
     films = [session.attempt({}) for _ in range(8)]
@@ -183,5 +183,5 @@ def test_play_refuses_unplayable_arguments(split: Path, tmp_path: Path, address:
     level = tmp_path / "level.json"
     write_level_file(empty_file("m"), level)
     with pytest.raises(UserError, match="leave out"):
-        level_to_play(level, 1, "m")
-    assert level_to_play(level, None, "m")[1] is None
+        level_to_play(level, 1, None)
+    assert level_to_play(level, None, None)[1] is None
