@@ -111,7 +111,7 @@ def load_policy(folder: str | os.PathLike[str]) -> Policy:
     """Load the policy that `save_policy` or `levelproof clone` wrote.
 
     Args:
-        folder: the policy's folder; `builtin:s` names the policy for size s that comes with levelproof.
+        folder: the policy's folder; `builtin:s` and `builtin:m` name those that come with levelproof.
 
     Raises:
         PolicyError: the folder has no policy, or it is damaged or of a later version.

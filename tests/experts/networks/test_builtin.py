@@ -13,19 +13,20 @@ NAMES = sorted(folder.name for folder in BUILTIN_AT.iterdir())
 
 
 def test_builtin_policies_are_small_and_say_how_they_were_made() -> None:
-    assert NAMES == ["s"]
+    assert NAMES == ["m", "s"]
     for name in NAMES:
         files = {path.name: path.stat().st_size for path in (BUILTIN_AT / name).iterdir()}
         assert set(files) == {"README.md", "config.json", "looks.jsonl", "policy.safetensors"}
         assert sum(files.values()) < 1_000_000
-        assert "levelproof clone" in (BUILTIN_AT / name / "README.md").read_text()
+        assert "levelproof train" in (BUILTIN_AT / name / "README.md").read_text()
 
 
 @pytest.mark.slow
-def test_builtin_policy_solves_levels_that_it_has_not_seen() -> None:
-    """Far more than doing nothing does, on levels behind those that it was cloned from."""
-    policy, ids = load_policy(f"{BUILTIN}s"), np.arange(500_000, 500_128, dtype=np.int32)
-    levels = jax.device_get(sample_levels(ids, "s"))
+@pytest.mark.parametrize("name", NAMES)
+def test_builtin_policy_solves_levels_that_it_has_not_seen(name: str) -> None:
+    """Far more than doing nothing does, on levels behind those that it learned from."""
+    policy, ids = load_policy(f"{BUILTIN}{name}"), np.arange(500_000, 500_128, dtype=np.int32)
+    levels = jax.device_get(sample_levels(ids, name))
     tries = play_sampled(policy.network)
     solved = play(tries, policy.params, levels, ids, 1, 0, DEFAULT_RULES).solved.mean()
     idle = play(do_nothing, (), levels, ids, 1, 0, DEFAULT_RULES).solved.mean()
@@ -33,5 +34,5 @@ def test_builtin_policy_solves_levels_that_it_has_not_seen() -> None:
 
 
 def test_load_policy_names_the_builtin_ones() -> None:
-    with pytest.raises(PolicyError, match="There is no policy builtin:x: levelproof comes with builtin:s"):
+    with pytest.raises(PolicyError, match="There is no policy builtin:x: levelproof comes with builtin:m, builtin:s"):
         load_policy("builtin:x")
