@@ -25,7 +25,7 @@ from levelproof.pipeline.learn.sealed import SEALED, known_sealed
 from levelproof.pipeline.learn.solve_rates import interval, solve_rates
 from levelproof.pipeline.learn.specialists import sealed_specialists, specialists_of
 from levelproof.pipeline.store.manifest import read_manifest
-from tests.pipeline.command import assert_refused, here, run
+from tests.pipeline.command import ROOT, assert_refused, here, run
 from tests.pipeline.made import honest_split
 from tests.quick import jit_once
 
