@@ -22,6 +22,7 @@ MAX_MAPS = 40_000
 # Workers and the commands that tests start inherit the cache folder. Set up before any test touches JAX.
 os.environ.setdefault(CACHE_VARIABLE, str(ROOT / ".pytest_cache" / "levelproof"))
 prepare_jax()
+jax.devices()  # one, from here on: else a test that trains first would give later tests as many as there are cores
 # Ray starts workers with a niceness of 15: beside two tests that compute they get 4% of the machine, so that their
 # tests would wait for others to end, not for a defect.
 os.environ.setdefault("RAY_worker_niceness", "0")
