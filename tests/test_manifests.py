@@ -1,9 +1,6 @@
 """The committed reference manifest is reproducible."""
 
 import json
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import jax
@@ -27,14 +24,8 @@ ROWS = pq.read_table(FOLDER / "128k-s.parquet").to_pylist()
 WORLDS = dict(np.load(FOLDER / "128k-s-levels.npz"))
 IDS = np.array([row["level_id"] for row in ROWS])
 SEEDS = sorted(file.parent for file in FOLDER.glob("*/*/part-000.parquet"))
-
-
-@contextmanager
-def strict() -> Iterator[None]:
-    """Turn the warning of a level whose states differ into an error."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", levelproof.EngineDiffers)
-        yield
+# Turns the warning of a level whose states differ into an error
+strict = pytest.mark.filterwarnings("error::levelproof.EngineDiffers")
 
 
 def test_manifest_describes_the_default_dataset() -> None:
@@ -66,6 +57,7 @@ def test_example_in_the_docs_is_the_manifests_gallery() -> None:
         assert all(shown[name] == row[name] for name in ("content_hash", "label", "steps_to_goal", "config_hash"))
 
 
+@strict
 @pytest.mark.parametrize(
     ("folder", "rows"),
     [(FOLDER / "256k" / "s", 64), *(pytest.param(folder, 500, marks=pytest.mark.slow) for folder in SEEDS)],
@@ -75,18 +67,17 @@ def test_seeds_grow_to_the_states_of_their_checksums(folder: Path, rows: int) ->
     """Any level whose first episode ended otherwise would be warned of."""
     data = levelproof.open(folder)
     some = np.random.default_rng(0).choice(len(data), rows, replace=False)
-    with strict():
-        batch = data.read(some, observation=None)
+    batch = data.read(some, observation=None)
     steps = data.manifest["steps_to_goal"].to_numpy()[some]
     assert batch.goal[np.arange(rows), steps - 1].all()
 
 
+@strict
 @pytest.mark.campaign
 @pytest.mark.parametrize("folder", SEEDS, ids=lambda folder: "-".join(folder.parts[-2:]))
 def test_every_seed_grows_to_its_checksum(folder: Path) -> None:
     data = levelproof.open(folder)
-    with strict():
-        steps = [data.episodes(part, observation=None).steps for part in np.array_split(np.arange(len(data)), 16)]
+    steps = [data.episodes(part, observation=None).steps for part in np.array_split(np.arange(len(data)), 16)]
     assert np.array_equal(np.concatenate(steps), data.manifest["steps_to_goal"].to_numpy())
 
 

@@ -15,6 +15,7 @@ WHERE = "count only rows that meet this condition on the manifest's columns"
 AGAINST = "look for the same levels in another split, a level file, or a folder of them (may be repeated)"
 COLUMNS = "comma-separated columns to show (default: a few on screen, else all)"
 SORT = "column or SQL expression to sort by; append DESC for largest first (default: level_id)"
+IGNORED = {"csv": ("against",), "plot": ("against", "columns", "sort", "limit")}  # options by output
 LIMIT = "number of rows, and of duplicate pairs, to show (default: 10; with --csv all)"
 
 
@@ -54,10 +55,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _require_effect(arguments: argparse.Namespace) -> None:
     """Raise UserError for an option that the chosen output ignores."""
-    output = "csv" if arguments.csv else "plot" if arguments.plot else ""
-    given = {"against": bool(arguments.against)}
-    if output == "plot":
-        given |= {name: getattr(arguments, name) is not None for name in ("columns", "sort", "limit")}
-    for name in given:
-        if output and given[name]:
-            raise UserError(f"--{name} has no effect with --{output}: leave one of them out.")
+    for output, ignored in IGNORED.items():
+        for name in ignored:
+            if getattr(arguments, output) and getattr(arguments, name):
+                raise UserError(f"--{name} has no effect with --{output}: leave one of them out.")

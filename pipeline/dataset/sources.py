@@ -55,11 +55,9 @@ class TrajectorySource:
         """Return several elements; torch calls this, if present, to read a batch at once."""
         _, length, fields, observation = self._settings
         if os.getpid() != self._process and (observation or self._data.simulates):
-            what, way = (
-                ("simulate records, which this split does not store whole,", "")
-                if self._data.simulates
-                else ("compute observations", ", or pass observation=None")
-            )
+            what, way = "compute observations", ", or pass observation=None"
+            if self._data.simulates:
+                what, way = "simulate records, which this split does not store whole,", ""
             raise UserError(
                 f"A forked process cannot {what} with JAX: pass the DataLoader multiprocessing_context='spawn'{way}."
             )

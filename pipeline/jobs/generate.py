@@ -178,8 +178,7 @@ def _work(
                 raise Failure(outcome.fatal)
             if outcome.summary:
                 events.ended(outcome)
-                if outcome.summary.levels:
-                    sealer.committed(unit)
+                sealer.committed(unit, outcome.summary.levels)
                 continue
             last = scheduler.failed(unit)
             events.ended(outcome, last)

@@ -110,10 +110,11 @@ class Sealer:
         self._running: tuple[list[Piece], Future[Piece]] | None = None
         self._broken = False
 
-    def committed(self, unit: WorkUnit) -> None:
-        """Add a unit's new fragment."""
-        path = fragment_path(self._split, unit.name)
-        self._pieces[path] = Piece(path, len(unit.level_ids), False)
+    def committed(self, unit: WorkUnit, levels: int) -> None:
+        """Add the new fragment of a unit with so many levels; a unit without any has written none."""
+        if levels:
+            path = fragment_path(self._split, unit.name)
+            self._pieces[path] = Piece(path, levels, False)
 
     def advance(self, first: int | None) -> None:
         """Account for a finished seal, and start the next if enough fragments lie below level id `first`.

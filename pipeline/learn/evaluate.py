@@ -92,8 +92,8 @@ def evaluate(
         log, name = (policy.with_suffix(f".{LOOKS}"), AGENT) if agent else (policy / LOOKS, SAMPLED)
         if looks := log_look(log, name, facts, attempts, seed):
             say(console, f"Look {looks} at the sealed levels; {log} lists all of this policy.")
-        elif not str(policy).startswith(BUILTIN):  # others cannot know of these looks
-            say(console, f"Cannot write {log}: note yourself that this was a look at the sealed levels.")
+        elif not str(policy).startswith(BUILTIN):  # those that come with levelproof were chosen before this look
+            say(console, f"Cannot write {log}, so nothing there says that you have looked at the sealed levels.")
     if as_json:
         json.dump({"policy": policy and str(policy), "attempts": attempts, "seed": seed, "levels": facts}, sys.stdout)
         print()

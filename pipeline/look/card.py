@@ -11,7 +11,6 @@ from itertools import chain
 from pathlib import Path
 
 import duckdb
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image
@@ -105,13 +104,12 @@ def _facts(path: str, manifest: Manifest) -> SplitFacts:
     table = manifest.table
     labels = {entry["values"]: entry["counts"] for entry in table.column("label").value_counts().to_pylist()}
     solved = table.filter(manifest.labels == Label.SOLVED)
-    split, witnesses = manifest.split, table.num_rows - table.column("shard").null_count
-    shards, seeds = split / SHARDS, is_seed(split)
-    if seeds:  # a record repeats its first episode
-        rows, transitions = f"{path}/*{SUFFIX}" if split.is_dir() else path, _total_steps(table)
+    split, shards, seeds = manifest.split, manifest.split / SHARDS, is_seed(manifest.split)
+    if seeds:
+        rows = f"{path}/*{SUFFIX}" if split.is_dir() else path
         split_bytes = shard_bytes = bytes_named(split, manifest.shards)
     else:
-        rows, transitions, split_bytes = f"{path}/manifest/*.parquet", witnesses * RECORD_STEPS, stored_bytes(split)
+        rows, split_bytes = f"{path}/manifest/*.parquet", stored_bytes(split)
         shard_bytes = stored_bytes(shards) if shards.is_dir() else 0
     return SplitFacts(
         path=path,
@@ -119,8 +117,8 @@ def _facts(path: str, manifest: Manifest) -> SplitFacts:
         rows=rows,
         labels=labels,
         distinct=len(table.column("content_hash").unique()),
-        witnesses=witnesses,
-        transitions=transitions,
+        witnesses=table.num_rows - table.column("shard").null_count,
+        transitions=manifest.transitions,
         steps_to_goal=solved.column("steps_to_goal").to_numpy(),
         split_bytes=split_bytes,
         shard_bytes=shard_bytes,
@@ -130,10 +128,6 @@ def _facts(path: str, manifest: Manifest) -> SplitFacts:
         stored_as=", ".join(sorted(set[str]().union(*(fragment.densities for fragment in manifest.counting)))),
         made_with=_made_with(table),
     )
-
-
-def _total_steps(table: pa.Table) -> int:
-    return int(np.nansum(table.column("steps_to_goal").to_numpy()))
 
 
 def _distribution(manifest: Manifest) -> str:

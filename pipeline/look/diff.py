@@ -15,7 +15,6 @@ from jaxtyping import Bool
 from rich.console import Console
 from rich.table import Table
 
-from levelproof.configs.schema import REPEATED
 from levelproof.experts.labels import TRAINED, WITNESSED, Label
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look import cost
@@ -119,8 +118,8 @@ def _labelled(rows: pa.Table, labels: frozenset[Label]) -> Bool[np.ndarray, " ro
 
 
 def _spent(rows: pa.Table, manifest: Manifest) -> dict[str, int] | None:
-    """Total the env steps by stage; None in seeds, which do not have them."""
-    if REPEATED.items() <= (manifest.config or {}).items():
+    """Total the env steps by stage; None where costs were left behind."""
+    if manifest.repeats:
         return None
     return {name: int(rows[name].to_numpy().sum()) for name in SPENT}
 

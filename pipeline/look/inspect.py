@@ -14,8 +14,6 @@ import pyarrow.compute as pc
 from rich.console import Console
 
 from levelproof.configs.compose import name_and_hash
-from levelproof.configs.schema import REPEATED
-from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.labels import DIVERGED, Label
 from levelproof.pipeline.look import cost, duplicates
 from levelproof.pipeline.look.entities import solved_by_entities
@@ -90,9 +88,7 @@ def _summary(split: Path, manifest: Manifest, chosen: pa.Table, labels: dict[str
     solved, unsolved = (of_label.get(label, none) for label in (Label.SOLVED, Label.UNSOLVED))
     tried = solved.num_rows + unsolved.num_rows
     stored = bytes_named(split, manifest.shards) if is_listed(split) else None
-    kept = manifest.table.num_rows - manifest.table.column("shard").null_count
-    is_repeated = REPEATED.items() <= (manifest.config or {}).items()  # then the others are copies
-    transitions = _total(manifest.table["steps_to_goal"].to_numpy()) if is_repeated else kept * RECORD_STEPS
+    transitions = manifest.transitions
     distribution = distribution_of(manifest)
     after = solved["env_steps"].to_numpy() - solved["steps_to_first_success"].to_numpy()
     spent = {name: _total(chosen[name].to_numpy()) for name in SPENT}
@@ -112,10 +108,10 @@ def _summary(split: Path, manifest: Manifest, chosen: pa.Table, labels: dict[str
         "witness": _counts(chosen.select(["witness"]).filter(pc.is_valid(chosen["witness"])), "witness"),  # pyright: ignore[reportAttributeAccessIssue]
         "steps_to_goal": _quantiles(solved, "steps_to_goal"),
         "steps_to_first_success": _quantiles(solved, "steps_to_first_success"),
-        **(dict.fromkeys(spent) if is_repeated else spent),  # seeds leave costs behind
+        **(dict.fromkeys(spent) if manifest.repeats else spent),
         "cost": cost.cost_of(chosen),
         "split_bytes": stored,  # all shards, whatever the condition
-        "bytes_per_transition": stored / transitions if stored and kept else None,
+        "bytes_per_transition": stored / transitions if stored and transitions else None,
     }
 
 

@@ -80,8 +80,8 @@ def _origin_of(path: Path, job: JobConfig) -> Origin:
         raise LevelFileError(f"Cannot use the level file {path}: {error!s:.300}") from None
     if other := _other_rules(file, job):
         raise LevelFileError(
-            f"Cannot use the level file {path}: its rules differ from this command's. Label it first, separately "
-            f"from files with yet other rules: levelproof generate level_files={path} {' '.join(other)}"
+            f"Cannot use the level file {path}: its rules differ from this command's. This labels it, separately "
+            f"from files with other rules: levelproof generate level_files={path} {' '.join(other)}"
         )
     return Origin(content_hashes(file.level)[0], str(path), size)
 

@@ -30,7 +30,6 @@ A_VALUE = 16  # bytes that a value takes besides those of its page
 UNSEEN = "content_hash"  # only compared, never printed, so its characters are not checked
 ARROW_SCHEMA = b"ARROW:schema"  # key of metadata
 WRITER = "parquet-cpp-arrow"  # from files of other writers, Arrow may read more than the footer says
-
 # What reading untrusted bytes can raise
 DAMAGE = (OSError, pa.ArrowException, LookupError, ValueError, TypeError, AttributeError, RuntimeError, MemoryError)
 READ_OPTIONS = {

@@ -18,6 +18,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from levelproof.configs.convert import flat
+from levelproof.configs.schema import REPEATED
+from levelproof.experts.config import RECORD_STEPS
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.store import files
 from levelproof.pipeline.store.bar import with_bar
@@ -159,6 +161,18 @@ class Manifest:
     def config(self) -> dict[str, Any] | None:
         """Settings that made the split; None if it is empty."""
         return self.fragments[0].config if self.fragments else None
+
+    @property
+    def repeats(self) -> bool:
+        """Whether records repeat their first episode, without costs: in seeds, and in splits grown from them."""
+        return REPEATED.items() <= (self.config or {}).items()
+
+    @property
+    def transitions(self) -> int:
+        """Env steps of all records, without repetitions. KeyError: `shard` or `steps_to_goal` was not read."""
+        if self.repeats:
+            return int(np.nansum(self.table["steps_to_goal"].to_numpy()))
+        return (self.table.num_rows - self.table["shard"].null_count) * RECORD_STEPS
 
     @property
     def config_hash(self) -> str | None:

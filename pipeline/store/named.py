@@ -20,8 +20,7 @@ def open_shard(split: Path, name: str, size: str) -> Shard:
     if not is_seed(split):
         return Shard(data_path(split, name), size)
     file = file_of(split, name)
-    about = None if is_remote(file) else file.stat()
-    return _seed_shard(file, size, about and (about.st_ino, about.st_size, about.st_mtime_ns))
+    return _seed_shard(file, size, _written(file))
 
 
 def bytes_named(split: Path, names: Iterable[str]) -> int:
@@ -35,6 +34,15 @@ def bytes_named(split: Path, names: Iterable[str]) -> int:
 def _seed_shard(file: Path, size: str, written: tuple[int, ...] | None) -> SeedShard:
     """Open a seed file once until it is `written` again: exports read its rows a block at a time."""
     return SeedShard(file, size)
+
+
+def _written(file: Path) -> tuple[int, ...] | None:
+    """Return what differs once a file is written again; None for a URL, and for a file that is gone."""
+    try:
+        about = file.stat()
+    except OSError:
+        return None
+    return about.st_ino, about.st_size, about.st_mtime_ns
 
 
 def _bytes_of(file: Path) -> int:

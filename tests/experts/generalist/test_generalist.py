@@ -11,7 +11,7 @@ from levelproof.experts.generalist.config import CurriculumConfig, PPOConfig
 from levelproof.experts.generalist.curricula import fresh
 from levelproof.experts.generalist.learnability import learnability
 from levelproof.experts.generalist.rollout import Experience, table_of
-from levelproof.experts.generalist.train import _advantages, _averaged, _kl_weight
+from levelproof.experts.generalist.train import _advantages, _averaged, _kl_weight, _open_ended
 from levelproof.experts.policy import divergence, log_probability
 from levelproof.levelgen.level import ACTIONS
 from levelproof.levelgen.sampling.sampler import sample_levels, sampler
@@ -37,6 +37,8 @@ def test_truncated_episode_bootstraps_and_terminated_one_does_not() -> None:
     )
     np.testing.assert_allclose(ended, [1 + 0.9 * 20 - 10 + 0.72 * (2 - 20), 2 - 20, 0], rtol=1e-6)
     np.testing.assert_allclose(cut, [1 + 0.9 * 20 - 10, 0, 0], rtol=1e-6)
+    assert _open_ended(experience([False, True, True], [False, False, True]))[:, 0].tolist() == [False, True, False]
+    assert _open_ended(experience([False, True, False], [False, True, False]))[:, 0].tolist() == [False, False, True]
     np.testing.assert_allclose(last, [1 + 0.9 * 20 - 10 + 0.72 * (2 + 0.9 * 30 - 20), 2 + 0.9 * 30 - 20, 0], rtol=1e-6)
 
 

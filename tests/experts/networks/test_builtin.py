@@ -18,7 +18,7 @@ def test_builtin_policies_are_small_and_say_how_they_were_made() -> None:
         files = {path.name: path.stat().st_size for path in (BUILTIN_AT / name).iterdir()}
         assert set(files) == {"README.md", "config.json", "looks.jsonl", "policy.safetensors"}
         assert sum(files.values()) < 1_000_000
-        assert "levelproof train" in (BUILTIN_AT / name / "README.md").read_text()
+        assert "levelproof clone" in (BUILTIN_AT / name / "README.md").read_text()
 
 
 @pytest.mark.slow
