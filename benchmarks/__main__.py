@@ -29,6 +29,7 @@ BENCHMARKS = {  # name: (module, what it measures)
     "prior": ("benchmarks.prior", "what attempts of a policy before the search would find and save"),
     "training": ("benchmarks.training", "env steps/s of rollout, update, and the program that does both"),
     "networks": ("benchmarks.networks", "multiply-adds of the networks, and env steps/s of training with each"),
+    "kinds": ("benchmarks.kinds", "networks of policies: clones at equal core-seconds, and their FLOP/s"),
     "floor": ("benchmarks.floor", "what each stage of a physics step costs, and the floor of its arithmetic"),
     "scaling": ("benchmarks.scaling", "env steps/s against active contacts, and against bodies"),
     "observation": ("benchmarks.observation", "what the symbolic-flat observation costs beside the step"),
@@ -105,7 +106,7 @@ def show(report: Report, run: Run, args: argparse.Namespace) -> None:
         RESULTS.mkdir(parents=True, exist_ok=True)
         for name, draw in report.plots.items():
             draw(RESULTS / name)
-        (RESULTS / f"{args.benchmark}.md").write_text(as_page(report, run))
+        (RESULTS / f"{report.page or args.benchmark}.md").write_text(as_page(report, run))
     if report.fault:
         print(f"Error: {report.fault}", file=sys.stderr)
 

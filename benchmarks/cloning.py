@@ -16,8 +16,10 @@ from typing import Any
 
 import numpy as np
 
+import levelproof
 from benchmarks.plotting import pyplot
 from benchmarks.report import Report, Table
+from levelproof.levelgen.level import name_of
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.learn.evaluate import ALL, SOLVED
 from levelproof.pipeline.runtime import own_cores
@@ -33,7 +35,6 @@ BASELINES = (
     "its own expert, 64k",
     "its own expert, 256k",
 )
-PLOT = "cloning.svg"
 BLUE, GREEN, GREY = "#0072b2", "#009e73", "#777777"
 COLUMNS = {  # of sealed levels: which of them count, who plays, and which of its rates
     "sampled, of all": (ALL, SAMPLED, "once"),
@@ -47,6 +48,7 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("split", type=Path, help="split to clone from, with enough solved levels")
     parser.add_argument("--levels", type=int, nargs="+", default=LEVELS, help="solved levels to clone from")
     parser.add_argument("--seeds", type=int, default=SEEDS, help=f"policies per number of levels (default: {SEEDS})")
+    parser.add_argument("--mirrored", type=int, nargs="*", default=(), help="of --levels, those to clone mirrored, too")
     parser.add_argument("--updates", type=int, default=UPDATES, help=f"updates of each policy (default: {UPDATES})")
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of every clone")
     parser.add_argument("--measured", type=int, default=2048, help="sealed levels to measure on (default: 2048)")
@@ -56,15 +58,19 @@ def register(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> Report:
     table = require_manifest(args.split, ["level_id", "label"]).table
     solved = table["level_id"].to_numpy()[np.array(table["label"].to_pylist()) == "solved"]
-    if max(args.levels) > len(solved):
+    if max((*args.levels, *args.mirrored)) > len(solved):
         raise UserError(f"{args.split} has {len(solved)} solved levels: choose fewer with --levels.")
-    runs = [(count, seed) for count in args.levels for seed in range(args.seeds)]
+    size = name_of(levelproof.open(args.split).size)
+    page = "cloning" if size == "s" else f"cloning_{size}"
+    kinds = [*((False, count) for count in args.levels), *((True, count) for count in args.mirrored)]
+    # Seed after seed, so that a run that is stopped leaves whole curves; mirrored, the first one alone
+    runs = [(*kind, seed) for seed in range(args.seeds) for kind in kinds if not (seed and kind[0])]
     with ThreadPoolExecutor(len(own_cores())) as threads:
-        results = [*threads.map(lambda one: measured(args, int(solved[one[0] - 1]), *one), runs)]
-    rows = [row_of(count, [each for each in results if each["levels"] == count]) for count in args.levels]
-    head = ("cloned from", *COLUMNS, "sampled, on levels cloned from")
+        results = [*threads.map(lambda one: measured(args, size, int(solved[one[1] - 1]), *one), runs)]
+    rows = [row_of(kind, [each for each in results if (each["mirrored"], each["levels"]) == kind]) for kind in kinds]
+    head = ("cloned from", "seeds", *COLUMNS, "sampled, on levels cloned from")
     counts = {name: f"{rates['random']['levels']:,}" for name, rates in results[0]["sealed"].items()}
-    title = f"Share of sealed levels solved: mean over {args.seeds} seeds (least to most)"
+    title = f"Share of sealed levels of {size} solved: mean over seeds (least to most)"
     players = results[0]["sealed"]
     others = [
         [name, *(interval_text(players[levels][name][key]) for levels, key in ((ALL, "once"), (SOLVED, "once"),
@@ -82,23 +88,29 @@ def run(args: argparse.Namespace) -> Report:
         ("baseline", "of all", "of solved", "of solved, best of 8"), others,
         "The same levels, with 95% intervals over levels",
     )  # fmt: skip
-    notes += [f"![Share of levels solved in one attempt, against the number of levels cloned from]({PLOT})"]
+    notes += [f"![Share of levels solved in one attempt, against the number of levels cloned from]({page}.svg)"]
     return Report(
         "Cloning against the number of levels", results, [Table(head, rows, title), second], notes,
-        plots={PLOT: lambda path: draw(path, results)},
+        plots={f"{page}.svg": lambda path: draw(path, results)}, page=page,
     )  # fmt: skip
 
 
-def measured(args: argparse.Namespace, last: int, count: int, seed: int) -> dict[str, Any]:
+def measured(args: argparse.Namespace, size: str, last: int, mirrored: bool, count: int, seed: int) -> dict[str, Any]:
     """Clone one policy from the first `count` solved levels, the last of which has id `last`; measure it."""
-    policy = args.folder / f"{count}-{seed}"
+    policy = args.folder / f"{size}-{count}-{seed}{'-mirrored' * mirrored}"
     chosen = f"label = 'solved' AND level_id <= {last}"
-    settings = f"where={chosen}", f"train.updates={args.updates}", f"seed={seed}", *args.set
+    settings = (
+        f"where={chosen}",
+        f"train.updates={args.updates}",
+        f"seed={seed}",
+        *["mirror=true"] * mirrored,
+        *args.set,
+    )
     command("clone", args.split, "-o", policy, *settings)
     words = "--attempts", str(ATTEMPTS)
-    sealed = kept(policy / "sealed.json", policy, *words, "--levels", str(args.measured))
+    sealed = kept(policy / "sealed.json", policy, *words, "--size", size, "--levels", args.measured)
     seen = kept(policy / "seen.json", policy, *words, "--on", args.split, "--where", chosen, "--levels", "1024")
-    return {"levels": count, "seed": seed, "sealed": sealed, "seen": seen}
+    return {"levels": count, "mirrored": mirrored, "seed": seed, "sealed": sealed, "seen": seen}
 
 
 def kept(file: Path, *words: Any) -> dict[str, Any]:
@@ -128,10 +140,11 @@ def timed_command(*words: Any) -> tuple[str, float]:
         return output.read(), used.ru_utime + used.ru_stime
 
 
-def row_of(count: int, results: list[dict[str, Any]]) -> list[str]:
+def row_of(kind: tuple[bool, int], results: list[dict[str, Any]]) -> list[str]:
+    mirrored, count = kind
     ways = [("sealed", *way) for way in COLUMNS.values()] + [("seen", ALL, SAMPLED, "once")]
     rates = [[each[where][levels][player][key]["rate"] for each in results] for where, levels, player, key in ways]
-    return [f"{count:,}", *map(range_text, rates)]
+    return [f"{count:,}{', mirrored' * mirrored}", str(len(results)), *map(range_text, rates)]
 
 
 def range_text(rates: list[float]) -> str:
@@ -148,6 +161,7 @@ def draw(path: Path, results: list[dict[str, Any]]) -> None:
     plt = pyplot()
 
     figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
+    results = [each for each in results if not each["mirrored"]]
     counts = sorted({each["levels"] for each in results})
     for where, levels, colour, name in (
         ("seen", ALL, GREEN, "levels cloned from"),

@@ -44,6 +44,7 @@ class Report:
     )  # by file name: function that draws the plot
     reference: Mapping[str, str] = field(default_factory=dict)  # versions of the reference, if it took part
     fault: str = ""  # makes the command fail
+    page: str = ""  # name of the page, if not the benchmark's
     made: str = ""  # when and where it was measured, if not now and here
 
 

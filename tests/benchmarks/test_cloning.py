@@ -23,7 +23,7 @@ def test_cloning_measures_policies_and_keeps_them(tmp_path: Path) -> None:
     for name, draw in first.plots.items():
         draw(tmp_path / name)
         assert (tmp_path / name).read_text().rstrip().endswith("</svg>")
-    kept = [tmp_path / f"kept/{solved}-0" / name for name in ("sealed.json", "seen.json")]
+    kept = [tmp_path / f"kept/s-{solved}-0" / name for name in ("sealed.json", "seen.json")]
     before = [file.stat().st_mtime_ns for file in kept]
     assert run(args).results == first.results
     assert [file.stat().st_mtime_ns for file in kept] == before

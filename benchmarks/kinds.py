@@ -1,0 +1,229 @@
+"""Networks of policies for all levels: clones at equal core-seconds, and the arithmetic that each update reaches.
+
+Every network clones the same levels for the same core-seconds of one core; how many updates that is, follows from its
+speed, measured first and kept. A stopped run resumes: `levelproof clone` from its checkpoint, and the folder keeps
+finished evaluations.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import training
+from benchmarks.cloning import GREEDY, SAMPLED, command, interval_text, kept
+from benchmarks.learners import lines_of
+from benchmarks.report import Report, Table
+from levelproof.configs.clone import CloneConfig
+from levelproof.configs.compose import compose_clone
+from levelproof.experts.config import ExpertConfig
+from levelproof.experts.imitation import Imitation, Transitions, begin_imitation, imitate
+from levelproof.experts.policy import initial, network_of
+from levelproof.experts.pool.pool import slot_count
+from levelproof.experts.training import ppo
+from levelproof.levelgen.level import name_of
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.actions import action_mask
+from levelproof.levelgen.task.observe.flat import dynamic_features
+from levelproof.physics.types import Size
+from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.learn.clone import size_for, source_of
+from levelproof.pipeline.learn.evaluate import SOLVED
+from levelproof.pipeline.learn.pool import Feed, PartedSplit
+from levelproof.pipeline.runtime import own_cores, prepare_jax
+
+FEW, REPEATS, DRAWN = 2, 5, 100  # updates at once, how often, and batches drawn
+EXPERTS = "experts' own"
+
+
+class Kind(NamedTuple):
+    """A network, and how its clone is measured."""
+
+    settings: Sequence[str]  # of `levelproof clone`
+    attempts: int = 8  # at each sealed level
+
+
+KINDS = {
+    "attention": Kind(("network.width=64",)),
+    "invariant": Kind(("network.kind=invariant", "network.width=256", "network.depth=3")),
+    "flat": Kind(("network.kind=flat", "network.width=256", "network.depth=3")),
+    "transformer": Kind(("network.kind=transformer", "network.width=128", "network.heads=8")),
+    "pixels": Kind(("network.kind=pixels", "network.width=256", "train.batch=128"), 1),
+}
+
+
+def register(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("split", type=Path, help="split to clone from")
+    parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS), help="default: all")
+    parser.add_argument("--core-seconds", type=float, default=400, help="of each clone's updates (default: 400)")
+    parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of every clone")
+    parser.add_argument("--measured", type=int, default=2048, help="sealed levels to measure on (default: 2048)")
+    parser.add_argument("--folder", type=Path, default=Path("kinds"), help="where everything is kept")
+
+
+def run(args: argparse.Namespace) -> Report:
+    args.folder.mkdir(parents=True, exist_ok=True)
+    file = args.folder / "speeds.json"
+    if not file.exists():
+        file.write_text(json.dumps(speeds(args)))
+    fast = json.loads(file.read_text())
+    results = [measured(args, name, fast[name]) for name in args.kinds]
+    players = results[0]["sealed"]
+    rows = [row_of(args, each) for each in results]
+    rows += [[name, *[""] * 4, interval_text(players[name]["once"]), "", interval_text(players[name]["best"])]
+             for name in ("random", "sticky random")]  # fmt: skip
+    head = ("network", "weights", "updates", "core-seconds", "accuracy, %", "sampled", "greedy", "best of 8")
+    paces = [[EXPERTS, *pace_cells(fast[EXPERTS])]]
+    paces += [[name, *pace_cells(fast[name]), f"{fast[name]['feeding']:.1%}"] for name in args.kinds]
+    paces[0].append("")
+    return Report(
+        "Networks of policies",
+        results,
+        [
+            Table(head, rows, f"Share of the solved sealed levels that clones of {args.split} solve; 95% intervals"),
+            Table(("network", "samples/s", "kFLOP per sample", "GFLOP/s", "reading and drawing"), paces,
+                  "Updates on one core"),
+        ],
+        [
+            f"One seed each, with as many updates as take {args.core_seconds:,.0f} core-seconds at the speed of the "
+            f"second table; core-seconds also have reading, compiling and validation. `levelproof clone {args.split} "
+            f"train.updates=... {' '.join(args.set)}` with: "
+            + "; ".join(f"*{name}*: `{' '.join(KINDS[name].settings)}`" for name in args.kinds) + ".",
+            "*Accuracy*: share of the entries of validation levels whose most probable choice the witness took. "
+            f"Sealed levels: the {players['random']['levels']:,} that are labelled solved, 8 attempts each, but one "
+            "of the policy on pixels.",
+            f"The experts' own network trains in slots of {slot_count(ExpertConfig())}, and a sample is an env step "
+            f"of one epoch. FLOP are those that XLA counts in an update before it optimises it. *Reading and drawing*: "
+            "share of the core-seconds of reading the levels and drawing batches from them, besides the updates; "
+            "policies' are measured with their batches at hand.",
+        ],
+    )  # fmt: skip
+
+
+def measured(args: argparse.Namespace, name: str, fast: Mapping[str, Any]) -> dict[str, Any]:
+    """Clone with one network, and measure the policy on sealed levels."""
+    kind, policy = KINDS[name], args.folder / name
+    updates = max(1, round(args.core_seconds * fast["samples_per_second"] / fast["batch"]))
+    command("clone", args.split, "-o", policy, *kind.settings, f"train.updates={updates}", *args.set)
+    words = "--size", fast["size"], "--attempts", kind.attempts, "--levels", args.measured
+    sealed = kept(policy / "sealed.json", policy, *words)[SOLVED]
+    return {"network": name, "updates": updates, "weights": fast["weights"], "sealed": sealed,
+            "metrics": lines_of(policy)[-1]}  # fmt: skip
+
+
+def row_of(args: argparse.Namespace, result: Mapping[str, Any]) -> list[str]:
+    sealed, metrics = result["sealed"], result["metrics"]
+    best = interval_text(sealed[SAMPLED]["best"]) if KINDS[result["network"]].attempts > 1 else ""
+    return [
+        result["network"],
+        f"{result['weights']:,}",
+        f"{result['updates']:,}",
+        f"{metrics['bc/core_seconds']:,.0f}",
+        f"{metrics['bc/validation_accuracy']:.1%}",
+        *(interval_text(sealed[player]["once"]) for player in (SAMPLED, GREEDY)),
+        best,
+    ]
+
+
+def pace_cells(fast: Mapping[str, Any]) -> list[str]:
+    rate, flops = fast["samples_per_second"], fast["flops_per_sample"]
+    return [f"{rate:,.0f}", f"{flops / 1e3:,.0f}", f"{rate * flops / 1e9:.1f}"]
+
+
+def speeds(args: argparse.Namespace) -> dict[str, Any]:
+    """Measure the updates of the policies' networks and of the experts', in turns on one core."""
+    prepare_jax(min(own_cores()))
+    configs = {name: compose_clone((*KINDS[name].settings, *args.set)) for name in args.kinds}
+    sources = [source_of(args.split, next(iter(configs.values())), lambda _: None)]
+    size = sources[0].data.size
+    feeds = {name: fed(sources, config) for name, config in configs.items()}
+    updates = {name: Update(sources, config, feeds[name][0]) for name, config in configs.items()}
+    experts, expert = ExpertConfig(), ready_experts(size)
+    calls: dict[str, Callable[[], Any]] = {EXPERTS: expert, **updates}
+    taken = turns(calls)
+    samples = slot_count(experts) * experts.steps_per_update * experts.epochs
+    found = {EXPERTS: {"samples_per_second": samples / taken[EXPERTS], "flops_per_sample": expert_flops(size, experts)}}
+    for name, update in updates.items():
+        batch, feeding = configs[name].train.batch, feeds[name][1]
+        found[name] = {
+            "size": name_of(size),
+            "batch": batch,
+            "samples_per_second": FEW * batch / taken[name],
+            "flops_per_sample": update.flops / batch,
+            "weights": sum(x.size for x in jax.tree.leaves(update.state.params)),
+            "feeding": feeding / (feeding + taken[name] / FEW),
+        }
+    return found
+
+
+class Update:
+    """Updates of one network from a batch at hand."""
+
+    def __init__(self, sources: Sequence[PartedSplit], config: CloneConfig, batch: Transitions) -> None:
+        self._batch, self._config = batch, config
+        self.state: Imitation = begin_imitation(np.int32(0), config.network, size_for(sources, config), config.train)
+        self.flops = flops_of(imitate.lower(self.state, batch, config.network, config.train))
+
+    def __call__(self) -> Any:
+        for _ in range(FEW):
+            self.state, _ = imitate(self.state, self._batch, self._config.network, self._config.train)
+        return self.state
+
+
+def fed(sources: Sequence[PartedSplit], config: CloneConfig) -> tuple[Transitions, float]:
+    """Return a batch, and the core-seconds of a batch: drawing, and its share of reading the levels in memory."""
+    begin = time.process_time()
+    batches: Iterator[Transitions] = Feed(sources, config, lambda _: None).batches(0)
+    batch = next(batches)
+    reading = time.process_time() - begin
+    begin = time.process_time()
+    for _ in range(DRAWN):
+        next(batches)
+    return batch, reading / config.refresh + (time.process_time() - begin) / DRAWN
+
+
+def ready_experts(size: Size) -> Callable[[], Any]:
+    """Return a function that makes an update of each expert in the slots of a pool."""
+    config = ExpertConfig()
+    levels = jax.device_get(sample_levels(jnp.arange(slot_count(config)), size))
+    calls = training.calls(levels, config)
+    next(calls)
+    return next(calls)
+
+
+def expert_flops(size: Size, config: ExpertConfig) -> float:
+    """Count the FLOP of one sample in an epoch of an expert's update."""
+    network, level = network_of(size, config), sample_levels(jnp.arange(1), size)
+    features, live = network.constant(level), action_mask(level)
+    constants = jax.tree.map(lambda x: x[..., 0], ppo.LevelConstants(features, live))
+    params = initial(jax.random.key(0), network, constants.features)
+    count, columns = config.steps_per_update // config.minibatches, len(dynamic_features(size)) + len(live) + 4
+    minibatch = ppo.from_rows(jnp.zeros((count, columns)))
+    gradient = jax.jit(jax.grad(ppo.loss), static_argnums=(1, 4))
+    return flops_of(gradient.lower(params, network, constants, minibatch, config)) / count
+
+
+def flops_of(program: jax.stages.Lowered) -> float:
+    """Return the FLOP of a program without loops, as XLA counts them before it optimises it."""
+    counted = program.cost_analysis()
+    if not counted:
+        raise Failure("This version of jaxlib counts no FLOP.")
+    return counted["flops"]
+
+
+def turns(calls: Mapping[str, Callable[[], Any]]) -> dict[str, float]:
+    """Return the median core-seconds of calls that take turns, after a first of each, which compiles."""
+    seconds = {name: [] for name in calls}
+    for repeat in range(1 + REPEATS):
+        for name, call in calls.items():
+            begin = time.process_time()
+            jax.block_until_ready(call())
+            if repeat:
+                seconds[name].append(time.process_time() - begin)
+    return {name: float(np.median(each)) for name, each in seconds.items()}
