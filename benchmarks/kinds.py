@@ -148,7 +148,9 @@ def speeds(args: argparse.Namespace) -> dict[str, Any]:
     calls: dict[str, Callable[[], Any]] = {EXPERTS: expert, **updates}
     taken = turns(calls)
     samples = slot_count(experts) * experts.steps_per_update * experts.epochs
-    found = {EXPERTS: {"samples_per_second": samples / taken[EXPERTS], "flops_per_sample": expert_flops(size, experts)}}
+    found: dict[str, Any] = {
+        EXPERTS: {"samples_per_second": samples / taken[EXPERTS], "flops_per_sample": expert_flops(size, experts)}
+    }
     for name, update in updates.items():
         batch, feeding = configs[name].train.batch, feeds[name][1]
         found[name] = {
