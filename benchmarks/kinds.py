@@ -8,7 +8,7 @@ finished evaluations.
 import argparse
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,21 +32,22 @@ from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.observe.flat import dynamic_features
 from levelproof.physics.types import Size
-from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.learn.clone import size_for, source_of
 from levelproof.pipeline.learn.evaluate import SOLVED
-from levelproof.pipeline.learn.pool import Feed, PartedSplit
+from levelproof.pipeline.learn.pool import PartedSplit, read_pool
 from levelproof.pipeline.runtime import own_cores, prepare_jax
 
 FEW, REPEATS, DRAWN = 2, 5, 100  # updates at once, how often, and batches drawn
-EXPERTS = "experts' own"
+ATTEMPTS = 8  # at each sealed level
+EXPERTS, BASELINES = "experts' own", ("random", "sticky random")
 
 
 class Kind(NamedTuple):
     """A network, and how its clone is measured."""
 
     settings: Sequence[str]  # of `levelproof clone`
-    attempts: int = 8  # at each sealed level
+    attempts: int = ATTEMPTS
 
 
 KINDS = {
@@ -68,40 +69,39 @@ def register(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> Report:
-    args.folder.mkdir(parents=True, exist_ok=True)
-    file = args.folder / "speeds.json"
-    if not file.exists():
-        file.write_text(json.dumps(speeds(args)))
-    fast = json.loads(file.read_text())
+    prepare_jax(min(own_cores()))  # keeps this process, and so its clones, to one core
+    fast = kept_speeds(args)
     results = [measured(args, name, fast[name]) for name in args.kinds]
-    players = results[0]["sealed"]
-    rows = [row_of(args, each) for each in results]
-    rows += [[name, *[""] * 4, interval_text(players[name]["once"]), "", interval_text(players[name]["best"])]
-             for name in ("random", "sticky random")]  # fmt: skip
-    head = ("network", "weights", "updates", "core-seconds", "accuracy, %", "sampled", "greedy", "best of 8")
-    paces = [[EXPERTS, *pace_cells(fast[EXPERTS])]]
-    paces += [[name, *pace_cells(fast[name]), f"{fast[name]['feeding']:.1%}"] for name in args.kinds]
-    paces[0].append("")
+    most = max(results, key=lambda each: KINDS[each["network"]].attempts)
+    players, attempts = most["sealed"], KINDS[most["network"]].attempts
+    rows = [row_of(each) for each in results]
+    rows += [[name, *[""] * 4, interval_text(players[name]["once"]), "", best_text(players[name], attempts)]
+             for name in BASELINES]  # fmt: skip
+    head = ("network", "weights", "updates", "core-seconds", "accuracy", "sampled", "greedy", "best of 8")
+    paces = [[EXPERTS, *pace_cells(fast[EXPERTS]), "", ""]]
+    paces += [[name, *pace_cells(fast[name]), *shares(fast, name)] for name in args.kinds]
+    further = "".join(f" {word}" for word in args.set)
     return Report(
-        "Networks of policies",
+        "Clones by several networks",
         results,
         [
             Table(head, rows, f"Share of the solved sealed levels that clones of {args.split} solve; 95% intervals"),
-            Table(("network", "samples/s", "kFLOP per sample", "GFLOP/s", "reading and drawing"), paces,
-                  "Updates on one core"),
+            Table(("network", "samples/s", "kFLOP per sample", "GFLOP/s", "of the experts'", "reading and drawing"),
+                  paces, "Updates on one core"),
         ],
         [
             f"One seed each, with as many updates as take {args.core_seconds:,.0f} core-seconds at the speed of the "
-            f"second table; core-seconds also have reading, compiling and validation. `levelproof clone {args.split} "
-            f"train.updates=... {' '.join(args.set)}` with: "
+            f"second table; the column of core-seconds includes reading, compiling and validation. "
+            f"`levelproof clone {args.split} train.updates=...{further}` with: "
             + "; ".join(f"*{name}*: `{' '.join(KINDS[name].settings)}`" for name in args.kinds) + ".",
-            "*Accuracy*: share of the entries of validation levels whose most probable choice the witness took. "
-            f"Sealed levels: the {players['random']['levels']:,} that are labelled solved, 8 attempts each, but one "
-            "of the policy on pixels.",
-            f"The experts' own network trains in slots of {slot_count(ExpertConfig())}, and a sample is an env step "
-            f"of one epoch. FLOP are those that XLA counts in an update before it optimises it. *Reading and drawing*: "
-            "share of the core-seconds of reading the levels and drawing batches from them, besides the updates; "
-            "policies' are measured with their batches at hand.",
+            "*Accuracy*: share of the entries of validation levels in which the policy's most probable choice is the "
+            f"witness's. Sealed levels: the {players['random']['levels']:,} that are labelled solved; attempts at "
+            "each: " + ", ".join(f"{name} {KINDS[name].attempts}" for name in args.kinds) + ".",
+            f"The experts' own network trains in slots of {slot_count(ExpertConfig())}; a sample of theirs is an env "
+            "step in one epoch. FLOP are those that XLA counts before it optimises a program, of a policy's update or "
+            "of the gradient of an expert's, whose optimiser adds about a hundredth. A policy's update is timed with "
+            "its batch at hand; *reading and drawing* is the share that these would add: reading the levels in "
+            "memory anew every `refresh` updates, and drawing each batch from them.",
         ],
     )  # fmt: skip
 
@@ -117,9 +117,8 @@ def measured(args: argparse.Namespace, name: str, fast: Mapping[str, Any]) -> di
             "metrics": lines_of(policy)[-1]}  # fmt: skip
 
 
-def row_of(args: argparse.Namespace, result: Mapping[str, Any]) -> list[str]:
+def row_of(result: Mapping[str, Any]) -> list[str]:
     sealed, metrics = result["sealed"], result["metrics"]
-    best = interval_text(sealed[SAMPLED]["best"]) if KINDS[result["network"]].attempts > 1 else ""
     return [
         result["network"],
         f"{result['weights']:,}",
@@ -127,8 +126,18 @@ def row_of(args: argparse.Namespace, result: Mapping[str, Any]) -> list[str]:
         f"{metrics['bc/core_seconds']:,.0f}",
         f"{metrics['bc/validation_accuracy']:.1%}",
         *(interval_text(sealed[player]["once"]) for player in (SAMPLED, GREEDY)),
-        best,
+        best_text(sealed[SAMPLED], KINDS[result["network"]].attempts),
     ]
+
+
+def best_text(rates: Mapping[str, Any], attempts: int) -> str:
+    return interval_text(rates["best"]) if attempts == ATTEMPTS else ""
+
+
+def shares(fast: Mapping[str, Any], name: str) -> list[str]:
+    """Return a network's share of the FLOP/s of the experts', and of its core-seconds that go into its batches."""
+    reached = [one["samples_per_second"] * one["flops_per_sample"] for one in (fast[name], fast[EXPERTS])]
+    return [f"{reached[0] / reached[1]:.0%}", f"{fast[name]['feeding']:.1%}"]
 
 
 def pace_cells(fast: Mapping[str, Any]) -> list[str]:
@@ -136,30 +145,41 @@ def pace_cells(fast: Mapping[str, Any]) -> list[str]:
     return [f"{rate:,.0f}", f"{flops / 1e3:,.0f}", f"{rate * flops / 1e9:.1f}"]
 
 
+def kept_speeds(args: argparse.Namespace) -> dict[str, Any]:
+    """Return what `speeds` finds, from its file if an earlier run measured the same."""
+    args.folder.mkdir(parents=True, exist_ok=True)
+    file = args.folder / "speeds.json"
+    of = [str(args.split), args.set, {name: [*KINDS[name].settings] for name in args.kinds}]
+    if not file.exists():
+        file.write_text(json.dumps({"of": of, "found": speeds(args)}))
+    kept = json.loads(file.read_text())
+    if kept["of"] != of:
+        raise UserError(f"{args.folder} has another command's networks, settings or split: choose another --folder.")
+    return kept["found"]
+
+
 def speeds(args: argparse.Namespace) -> dict[str, Any]:
     """Measure the updates of the policies' networks and of the experts', in turns on one core."""
-    prepare_jax(min(own_cores()))
     configs = {name: compose_clone((*KINDS[name].settings, *args.set)) for name in args.kinds}
-    sources = [source_of(args.split, next(iter(configs.values())), lambda _: None)]
-    size = sources[0].data.size
-    feeds = {name: fed(sources, config) for name, config in configs.items()}
-    updates = {name: Update(sources, config, feeds[name][0]) for name, config in configs.items()}
-    experts, expert = ExpertConfig(), ready_experts(size)
-    calls: dict[str, Callable[[], Any]] = {EXPERTS: expert, **updates}
-    taken = turns(calls)
+    source = source_of(args.split, next(iter(configs.values())), lambda _: None)
+    size, experts, feeds, updates = source.data.size, ExpertConfig(), {}, {}
+    for name, config in configs.items():
+        batch, feeds[name] = fed(source, config)
+        updates[name] = Update(source, config, batch)
+    taken = turns({EXPERTS: ready_experts(size), **updates})
     samples = slot_count(experts) * experts.steps_per_update * experts.epochs
     found: dict[str, Any] = {
         EXPERTS: {"samples_per_second": samples / taken[EXPERTS], "flops_per_sample": expert_flops(size, experts)}
     }
     for name, update in updates.items():
-        batch, feeding = configs[name].train.batch, feeds[name][1]
+        batch, seconds = configs[name].train.batch, taken[name] / FEW
         found[name] = {
             "size": name_of(size),
             "batch": batch,
-            "samples_per_second": FEW * batch / taken[name],
+            "samples_per_second": batch / seconds,
             "flops_per_sample": update.flops / batch,
             "weights": sum(x.size for x in jax.tree.leaves(update.state.params)),
-            "feeding": feeding / (feeding + taken[name] / FEW),
+            "feeding": feeds[name] / (feeds[name] + seconds),
         }
     return found
 
@@ -167,9 +187,9 @@ def speeds(args: argparse.Namespace) -> dict[str, Any]:
 class Update:
     """Updates of one network from a batch at hand."""
 
-    def __init__(self, sources: Sequence[PartedSplit], config: CloneConfig, batch: Transitions) -> None:
+    def __init__(self, source: PartedSplit, config: CloneConfig, batch: Transitions) -> None:
         self._batch, self._config = batch, config
-        self.state: Imitation = begin_imitation(np.int32(0), config.network, size_for(sources, config), config.train)
+        self.state: Imitation = begin_imitation(np.int32(0), config.network, size_for([source], config), config.train)
         self.flops = flops_of(imitate.lower(self.state, batch, config.network, config.train))
 
     def __call__(self) -> Any:
@@ -178,16 +198,19 @@ class Update:
         return self.state
 
 
-def fed(sources: Sequence[PartedSplit], config: CloneConfig) -> tuple[Transitions, float]:
-    """Return a batch, and the core-seconds of a batch: drawing, and its share of reading the levels in memory."""
+def fed(source: PartedSplit, config: CloneConfig) -> tuple[Transitions, float]:
+    """Return a batch, and the core-seconds of a batch: drawing it, and its share of reading the levels in memory."""
+    chosen, rng = source.train[: config.pool], np.random.default_rng(0)
+    read_pool(source.data, chosen[:1], config.network)  # compiles
     begin = time.process_time()
-    batches: Iterator[Transitions] = Feed(sources, config, lambda _: None).batches(0)
-    batch = next(batches)
-    reading = time.process_time() - begin
+    pool = read_pool(source.data, chosen, config.network)
+    reading = time.process_time() - begin if len(source.train) > config.pool else 0.0
+    draw = lambda: pool.draw(rng, rng.integers(0, len(pool.steps), config.train.batch))
     begin = time.process_time()
     for _ in range(DRAWN):
-        next(batches)
-    return batch, reading / config.refresh + (time.process_time() - begin) / DRAWN
+        draw()
+    drawing = time.process_time() - begin
+    return draw(), reading / config.refresh + drawing / DRAWN
 
 
 def ready_experts(size: Size) -> Callable[[], Any]:

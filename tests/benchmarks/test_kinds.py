@@ -6,6 +6,10 @@ import pytest
 
 from benchmarks import kinds
 from benchmarks.__main__ import parser
+from benchmarks.networks import multiply_adds
+from levelproof.experts.config import ExpertConfig
+from levelproof.levelgen.level import SIZES
+from levelproof.pipeline.errors import UserError
 from tests.pipeline.made import played_split
 
 pytestmark = pytest.mark.campaign
@@ -29,13 +33,12 @@ def test_networks_are_timed_cloned_and_kept(tmp_path: Path, monkeypatch: pytest.
     assert len(kept) == 3
     assert kinds.run(args).results == first.results
     assert [file.stat().st_mtime_ns for file in kept] == before
+    args.set = []
+    with pytest.raises(UserError, match="choose another --folder"):
+        kinds.run(args)
 
 
-def test_experts_flop_are_three_forward_passes(monkeypatch: pytest.MonkeyPatch) -> None:
-    from benchmarks.networks import multiply_adds
-    from levelproof.experts.config import ExpertConfig
-    from levelproof.levelgen.level import SIZES
-
+def test_experts_flop_are_three_forward_passes() -> None:
     counted = kinds.expert_flops(SIZES["s"], ExpertConfig())
     passes = 3 * 2 * multiply_adds("entity", SIZES["s"])
     assert 0.5 * passes < counted < 1.5 * passes
