@@ -19,6 +19,7 @@ class CloneConfig:
     pool: int = 16_384  # levels in memory; every update draws from all of them evenly
     refresh: int = 1000  # updates until other levels replace those in memory, if the splits have more
     interval: int = 500  # updates between validations, each with a checkpoint
+    played: int = 256  # of each split, validation levels that the policy plays at each validation, once each
     seed: int = 0  # seed of the initial weights and of all random draws
     log: Literal["none", "tensorboard", "wandb"] = "none"  # logger of scalars, besides metrics.jsonl
     network: NetworkConfig = field(default_factory=NetworkConfig)  # network of the policy
@@ -26,6 +27,7 @@ class CloneConfig:
 
     def __post_init__(self) -> None:
         require(self, ("pool", "refresh", "interval"), 1)
+        require(self, ("played",), 0)
         require(self, ("seed",), 0, 2**31 - 1)
         require(self, ("validation",), 0, 1)
         if self.validation in (0, 1):

@@ -3,15 +3,17 @@
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from flax.typing import VariableDict
 from rich.console import Console
 
 from levelproof.configs.clone import CloneConfig
 from levelproof.configs.convert import plain
-from levelproof.experts.imitation import Imitation, begin_imitation, compare, imitate
+from levelproof.experts.evaluation import FirstEpisodes, play, play_sampled
+from levelproof.experts.imitation import Imitation, Likeness, Transitions, begin_imitation, compare, imitate
 from levelproof.experts.networks.over_levels import PolicyKind
 from levelproof.experts.networks.saved import Policy
 from levelproof.levelgen.level import name_of
@@ -31,23 +33,29 @@ from levelproof.pipeline.learn.folder import (
     write_note,
 )
 from levelproof.pipeline.learn.metrics import Metrics
-from levelproof.pipeline.learn.pool import Feed, PartedSplit, Transitions, validation_batches
+from levelproof.pipeline.learn.pool import Feed, PartedSplit, validation_batches
 from levelproof.pipeline.learn.sealed import require_not_sealed, without_sealed
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.disk import explaining_writes
 from levelproof.pipeline.store.locks import only_clone
 from levelproof.pipeline.words import duration
 
+SOLVED = "eval/sampled_episode_solve_rate"
+EPISODES = {  # metrics of validation levels played, under the reference's names: values of episodes
+    SOLVED: lambda one: one.solved,
+    "eval/sampled_episode_length": lambda one: one.env_steps,
+}
 COURSE = Curves(
     "bc/updates",
     "updates",
     (
         Panel("Loss, nats per entry", {GREEN: "bc/loss", BLUE: "bc/validation_loss"}),
         Panel("Accuracy, share of entries", {GREEN: "bc/accuracy", BLUE: "bc/validation_accuracy"}, 1.0),
+        Panel("Levels solved, share", {BLUE: SOLVED}, 1.0),
     ),
     {GREEN: "training", BLUE: "validation"},
 )
-WITHOUT_EFFECT = ("log",)  # settings that a continued run may change
+WITHOUT_EFFECT = "log", "played"  # settings that a continued run may change
 
 
 def clone(splits: Sequence[Path], config: CloneConfig, out: Path, console: Console) -> None:
@@ -66,7 +74,8 @@ def clone(splits: Sequence[Path], config: CloneConfig, out: Path, console: Conso
         require_same_run(out, note)
         state = continued(out, begin_imitation(np.int32(config.seed), config.network, size, config.train))
         write_note(out, note)
-        metrics, done = Metrics(out, COURSE, config.log, note, int(state.updates), tell, require_ours), False
+        curves = COURSE if config.played else COURSE._replace(panels=COURSE.panels[:-1])
+        metrics, done = Metrics(out, curves, config.log, note, int(state.updates), tell, require_ours), False
 
         def save(state: Imitation) -> None:
             require_ours()
@@ -144,7 +153,7 @@ def train(
     before = metrics.last.get("bc/core_seconds", 0.0)
     with shown(console, "reading levels", last, first) as show:
         feed = Feed(sources, config, lambda count: show(0, f"reading {count} levels"))
-        held = {str(source.data.split): validation_batches(source, config) for source in sources}
+        held = {str(source.data.split): held_of(source, config) for source in sources}
         for update, batch in enumerate(feed.batches(first), first + 1):
             state, likeness = imitate(state, batch, config.network, config.train)
             recent.append(likeness)
@@ -169,12 +178,40 @@ def train(
     return state
 
 
-def validated(state: Imitation, held: dict[str, list[Transitions]], config: CloneConfig) -> dict[str, float]:
-    """Compare the averaged policy with the validation levels, of all splits and of each."""
-    each = {name: [compare(state.average, batch, config.network) for batch in some] for name, some in held.items()}
-    numbers = averages("validation_", [likeness for some in each.values() for likeness in some])
-    for name, some in each.items() if len(each) > 1 else ():
-        numbers |= {f"{key}/{name}": value for key, value in averages("validation_", some).items()}
+class Held(NamedTuple):
+    """What the policy is validated on, of one split."""
+
+    batches: list[Transitions]
+    play: Callable[[VariableDict], FirstEpisodes] | None  # plays some levels; None: none are to be played
+
+
+def held_of(source: PartedSplit, config: CloneConfig) -> Held:
+    batches, data = validation_batches(source, config), source.data
+    if not config.played:
+        return Held(batches, None)
+    some = np.random.default_rng(config.seed).permutation(source.validation)[: config.played]
+    ids, levels, player = data.manifest["level_id"].to_numpy()[some], data.levels(some), play_sampled(config.network)
+    return Held(batches, lambda params: play(player, params, levels, ids, 1, config.seed, data.rules))
+
+
+def validated(state: Imitation, held: dict[str, Held], config: CloneConfig) -> dict[str, float]:
+    """Compare the averaged policy with the validation levels, of all splits and of each; let it play some of them."""
+    params = state.average
+    each = {
+        name: ([compare(params, batch, config.network) for batch in one.batches], one.play and one.play(params))
+        for name, one in held.items()
+    }
+    numbers = validation_numbers([*each.values()])
+    for name, one in each.items() if len(each) > 1 else ():
+        numbers |= {f"{key}/{name}": value for key, value in validation_numbers([one]).items()}
+    return numbers
+
+
+def validation_numbers(each: Sequence[tuple[Sequence[Likeness], FirstEpisodes | None]]) -> dict[str, float]:
+    numbers = averages("validation_", [likeness for some, _ in each for likeness in some])
+    if episodes := [one for _, one in each if one]:
+        for name, which in EPISODES.items():
+            numbers[name] = float(np.concatenate([which(one) for one in episodes]).mean())
     return numbers
 
 
@@ -185,4 +222,6 @@ def averages(prefix: str, likenesses: Sequence[Any]) -> dict[str, float]:
 
 def line_of(update: int, last: int, numbers: dict[str, float]) -> str:
     loss, accuracy = (numbers[f"bc/validation_{name}"] for name in ("loss", "accuracy"))
-    return f"{update:,}/{last:,} updates · loss {numbers['bc/loss']:.3f} · validation {loss:.3f}, {accuracy:.1%} right"
+    solved = f" · {numbers[SOLVED]:.1%} solved" if SOLVED in numbers else ""
+    validation = f"validation {loss:.3f}, {accuracy:.1%} right"
+    return f"{update:,}/{last:,} updates · loss {numbers['bc/loss']:.3f} · {validation}{solved}"

@@ -13,7 +13,13 @@ import levelproof
 from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy, policy_logits
 from levelproof.experts.networks.saved import CONFIG, WEIGHTS, Policy
 from levelproof.levelgen.level import SIZES, Level, size_of
-from levelproof.levelgen.task.actions import action_mask
+from levelproof.levelgen.task.actions import (
+    MOTOR_BINDINGS,
+    MOTOR_CHOICES,
+    THRUSTER_BINDINGS,
+    THRUSTER_CHOICES,
+    action_mask,
+)
 from levelproof.levelgen.task.rules import reset
 from tests.experts.networks.weights import random_weights
 from tests.quick import jit_once
@@ -87,6 +93,27 @@ def test_parameters_do_not_depend_on_the_size(kind: PolicyKind) -> None:
     levels = levelproof.sample_levels(np.arange(2), bare)
     params = jit_once(initial_policy, static_argnums=(1, 2))(jax.random.key(0), network, SIZES["m"])
     assert np.isfinite(logits_of(params, network, levels)).all()
+
+
+def test_an_entry_has_the_logits_of_the_actuators_that_obey_it() -> None:
+    levels, policy = levelproof.sample_levels(np.arange(COUNT), "m"), policy_of(PolicyKind.ATTENTION)
+
+    def by_entry(motor: jax.Array, thruster: jax.Array) -> tuple[np.ndarray, np.ndarray]:
+        bound = replace(levels, motor_binding=motor, thruster_binding=thruster)
+        logits = np.asarray(logits_of(policy.params, policy.network, bound))
+        split = MOTOR_BINDINGS * MOTOR_CHOICES
+        return (logits[:split].reshape(MOTOR_BINDINGS, MOTOR_CHOICES, -1),
+                logits[split:].reshape(THRUSTER_BINDINGS, THRUSTER_CHOICES, -1))  # fmt: skip
+
+    of = levels.motor_binding, levels.thruster_binding
+    now = by_entry(*of)
+    turned = by_entry((of[0] + 1) % MOTOR_BINDINGS, (of[1] + 1) % THRUSTER_BINDINGS)
+    together = by_entry(0 * of[0], 0 * of[1])
+    for bound, other, one in zip(now, turned, together, strict=True):
+        assert np.abs(bound).max() > 0.1
+        np.testing.assert_allclose(other, np.roll(bound, 1, axis=0), atol=1e-5)
+        np.testing.assert_allclose(one[0], bound.sum(0), atol=1e-4)
+        assert not one[1:].any()
 
 
 def test_transformer_has_the_shape_of_the_reference() -> None:

@@ -34,7 +34,7 @@ from levelproof.pipeline.learn import pool as pool_module
 from levelproof.pipeline.learn import sealed
 from levelproof.pipeline.learn.clone import COURSE
 from levelproof.pipeline.learn.curves import draw_curves
-from levelproof.pipeline.learn.pool import read_pool
+from levelproof.pipeline.learn.pool import Feed, read_pool
 from levelproof.pipeline.learn.sealed import SEALED
 from levelproof.pipeline.runtime import CACHE_VARIABLE
 from levelproof.pipeline.store.locks import only_clone
@@ -42,7 +42,15 @@ from tests.pipeline.command import ROOT, assert_refused, here
 from tests.pipeline.made import played_split
 from tests.quick import jit_once
 
-SETTINGS = ("interval=20", "train.batch=128", "validation=0.3", "where=", "network.width=16", "network.depth=1")
+SETTINGS = (
+    "interval=20",
+    "played=0",
+    "train.batch=128",
+    "validation=0.3",
+    "where=",
+    "network.width=16",
+    "network.depth=1",
+)
 UPDATES = "train.updates=200"  # static in the programs, so other numbers of updates compile them again
 
 
@@ -59,7 +67,7 @@ def metrics(out: Path) -> list[dict[str, float]]:
 
 @pytest.fixture(scope="module")
 def policy(split: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return cloned(tmp_path_factory.mktemp("cloned"), split, UPDATES, "where=label = 'solved'")
+    return cloned(tmp_path_factory.mktemp("cloned"), split, UPDATES, "where=label = 'solved'", "played=8")
 
 
 def test_loss_falls(policy: Path) -> None:
@@ -68,6 +76,18 @@ def test_loss_falls(policy: Path) -> None:
     assert curve[-1]["bc/loss"] < 0.6 * curve[0]["bc/loss"]
     assert curve[-1]["bc/accuracy"] > 0.75
     assert {"bc/validation_loss", "bc/validation_accuracy", "bc/samples_per_second"} <= set(curve[-1])
+
+
+def test_validation_levels_are_played(policy: Path, split: Path) -> None:
+    names = ("eval/sampled_episode_solve_rate", "eval/sampled_episode_length")
+    played = [[numbers[name] for name in names] for numbers in metrics(policy)]
+    data = levelproof.open(split, where="label = 'solved'", validation=0.3)
+    held = module.in_subset(data.manifest["content_hash"].to_pylist(), "validation", 0.3)
+    count = min(8, int(held.sum()))
+    for rate, length in played:
+        assert 0 <= rate <= 1
+        assert rate * count == pytest.approx(round(rate * count))
+        assert 1 <= length <= RECORD_STEPS
 
 
 def test_curves_are_drawn_beside_the_policy(policy: Path, tmp_path: Path) -> None:
@@ -144,6 +164,25 @@ def test_splits_of_several_sizes_make_one_policy(split: Path, tmp_path: Path) ->
         assert jit_once(policy.logits)(levels, levels.state).shape == (sum(CHOICES), 2)
     done = here(["clone", str(split), str(larger), "network.kind=flat", "where="], tmp_path)
     assert_refused(done, 2, "levels of one size")
+
+
+def test_levels_weigh_equally_and_end_at_their_first_goal(split: Path) -> None:
+    """Levels are told apart by their bodies' densities, which no two of them share."""
+    config = replace(CloneConfig(), where="label = 'solved'", validation=0.3, train=ImitationConfig(100, batch=64))
+    source = module.source_of(split, config, lambda _: None)
+    pool = read_pool(source.data, source.train, config.network)
+    ends = np.array([int(np.argmax(source.data[i].done)) + 1 for i in source.train.tolist()])
+    np.testing.assert_array_equal(pool.steps, ends)
+    assert len(pool.motion) == len(pool.action) == ends.sum()
+    assert ends.max() > 1.5 * ends.min(), "levels of unequal length"
+    level_of = {np.ascontiguousarray(pool.level.density[:, i]).tobytes(): i for i in range(len(ends))}
+    assert len(level_of) == len(ends)
+    drawn = np.zeros(len(ends), int)
+    for batch in Feed([source], config, lambda _: None).batches(0):
+        for lane in range(config.train.batch):
+            drawn[level_of[np.ascontiguousarray(batch.level.density[:, lane]).tobytes()]] += 1
+    expected = drawn.sum() / len(ends)
+    assert np.abs(drawn - expected).max() < 5 * expected**0.5
 
 
 def test_bad_input_is_refused(split: Path, policy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
