@@ -167,7 +167,7 @@ def test_splits_of_several_sizes_make_one_policy(split: Path, tmp_path: Path) ->
 
 
 def test_levels_weigh_equally_and_end_at_their_first_goal(split: Path) -> None:
-    """Levels are told apart by their bodies' densities, which no two of them share."""
+    """Levels are told apart by their polygons, which no two of them share."""
     config = replace(CloneConfig(), where="label = 'solved'", validation=0.3, train=ImitationConfig(100, batch=64))
     source = module.source_of(split, config, lambda _: None)
     pool = read_pool(source.data, source.train, config.network)
@@ -175,12 +175,12 @@ def test_levels_weigh_equally_and_end_at_their_first_goal(split: Path) -> None:
     np.testing.assert_array_equal(pool.steps, ends)
     assert len(pool.motion) == len(pool.action) == ends.sum()
     assert ends.max() > 1.5 * ends.min(), "levels of unequal length"
-    level_of = {np.ascontiguousarray(pool.level.density[:, i]).tobytes(): i for i in range(len(ends))}
+    level_of = {np.ascontiguousarray(pool.level.model.vertices[..., i]).tobytes(): i for i in range(len(ends))}
     assert len(level_of) == len(ends)
     drawn = np.zeros(len(ends), int)
     for batch in Feed([source], config, lambda _: None).batches(0):
         for lane in range(config.train.batch):
-            drawn[level_of[np.ascontiguousarray(batch.level.density[:, lane]).tobytes()]] += 1
+            drawn[level_of[np.ascontiguousarray(batch.level.model.vertices[..., lane]).tobytes()]] += 1
     expected = drawn.sum() / len(ends)
     assert np.abs(drawn - expected).max() < 5 * expected**0.5
 
