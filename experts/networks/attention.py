@@ -118,7 +118,7 @@ class AttentionPolicy(nn.Module):
         first = x.shape[1] - joints - thrusters
         motors = ActuatorHead(self.width, MOTOR_CHOICES, name="motor")(x[:, first : first + joints], summary)
         thrusts = ActuatorHead(self.width, THRUSTER_CHOICES, name="thrust")(x[:, first + joints :], summary)
-        by_entry = [_obeying(*pair) for pair in ((tables.motors, motors), (tables.thrusts, thrusts))]
+        by_entry = [obeying(*pair) for pair in ((tables.motors, motors), (tables.thrusts, thrusts))]
         return jnp.concatenate(by_entry)
 
 
@@ -138,7 +138,7 @@ class ActuatorHead(nn.Module):
         return OnColumns(self.choices, kernel_init=last, name="Dense_2")(nn.relu(own + shared[:, None]))
 
 
-def _obeying(bound: Float[Array, "actuator entry lane"], logits: Float[Array, "choice actuator lane"]) -> Array:
+def obeying(bound: Float[Array, "actuator entry lane"], logits: Float[Array, "choice actuator lane"]) -> Array:
     """Add up the logits of the actuators that obey each entry: [logit, lane], entry after entry."""
     none = jnp.zeros((bound.shape[1], *logits.shape[::2]))
     by_entry = sum((bound[i, :, None] * logits[None, :, i] for i in range(len(bound))), none)

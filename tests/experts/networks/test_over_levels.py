@@ -10,16 +10,11 @@ import numpy as np
 import pytest
 
 import levelproof
+from levelproof.experts.networks.attention import ActuatorHead, obeying
 from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy, policy_logits
 from levelproof.experts.networks.saved import CONFIG, WEIGHTS, Policy
 from levelproof.levelgen.level import SIZES, Level, size_of
-from levelproof.levelgen.task.actions import (
-    MOTOR_BINDINGS,
-    MOTOR_CHOICES,
-    THRUSTER_BINDINGS,
-    THRUSTER_CHOICES,
-    action_mask,
-)
+from levelproof.levelgen.task.actions import CHOICES, MOTOR_CHOICES, action_mask
 from levelproof.levelgen.task.rules import reset
 from tests.experts.networks.weights import random_weights
 from tests.quick import jit_once
@@ -95,25 +90,25 @@ def test_parameters_do_not_depend_on_the_size(kind: PolicyKind) -> None:
     assert np.isfinite(logits_of(params, network, levels)).all()
 
 
-def test_an_entry_has_the_logits_of_the_actuators_that_obey_it() -> None:
+def test_an_actuator_has_logits_of_its_own_token() -> None:
+    tokens = np.random.default_rng(0).normal(size=(8, 3, COUNT)).astype(np.float32)
+    head, summary = ActuatorHead(8, MOTOR_CHOICES), np.ones((8, COUNT), np.float32)
+    params = head.init(jax.random.key(0), tokens, summary)
+    changed = tokens.copy()
+    changed[:, 1] += 1
+    both = [np.asarray(head.apply(params, each, summary)) for each in (tokens, changed)]
+    differs = np.abs(both[0] - both[1]).max((0, 2)) > 1e-6
+    assert differs.tolist() == [False, True, False]
+
+
+def test_an_entry_has_the_sum_of_the_logits_of_what_obeys_it() -> None:
     levels, policy = levelproof.sample_levels(np.arange(COUNT), "m"), policy_of(PolicyKind.ATTENTION)
-
-    def by_entry(motor: jax.Array, thruster: jax.Array) -> tuple[np.ndarray, np.ndarray]:
-        bound = replace(levels, motor_binding=motor, thruster_binding=thruster)
-        logits = np.asarray(logits_of(policy.params, policy.network, bound))
-        split = MOTOR_BINDINGS * MOTOR_CHOICES
-        return (logits[:split].reshape(MOTOR_BINDINGS, MOTOR_CHOICES, -1),
-                logits[split:].reshape(THRUSTER_BINDINGS, THRUSTER_CHOICES, -1))  # fmt: skip
-
-    of = levels.motor_binding, levels.thruster_binding
-    now = by_entry(*of)
-    turned = by_entry((of[0] + 1) % MOTOR_BINDINGS, (of[1] + 1) % THRUSTER_BINDINGS)
-    together = by_entry(0 * of[0], 0 * of[1])
-    for bound, other, one in zip(now, turned, together, strict=True):
-        assert np.abs(bound).max() > 0.1
-        np.testing.assert_allclose(other, np.roll(bound, 1, axis=0), atol=1e-5)
-        np.testing.assert_allclose(one[0], bound.sum(0), atol=1e-4)
-        assert not one[1:].any()
+    entries = np.split(np.asarray(logits_of(policy.params, policy.network, levels)), np.cumsum(CHOICES)[:-1])
+    moves = np.array([np.abs(entry).max(0) > 0 for entry in entries])
+    np.testing.assert_array_equal(moves, action_mask(levels))
+    bound, logits = np.zeros((3, 2, 1), np.float32), np.arange(6, dtype=np.float32).reshape(2, 3, 1)
+    bound[[0, 1, 2], [1, 0, 1]] = 1  # the first and last actuator obey entry 1, the other entry 0
+    assert obeying(bound, logits)[:, 0].tolist() == [1, 4, 0 + 2, 3 + 5]
 
 
 def test_transformer_has_the_shape_of_the_reference() -> None:
