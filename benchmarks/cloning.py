@@ -5,6 +5,7 @@ resumes from its checkpoint, and the folder keeps finished evaluations.
 """
 
 import argparse
+import itertools
 import json
 import os
 import subprocess
@@ -68,21 +69,27 @@ def run(args: argparse.Namespace) -> Report:
     with ThreadPoolExecutor(len(own_cores())) as threads:
         results = [*threads.map(lambda one: measured(args, size, int(solved[one[1] - 1]), *one), runs)]
     rows = [row_of(kind, [each for each in results if (each["mirrored"], each["levels"]) == kind]) for kind in kinds]
-    head = ("cloned from", "seeds", *COLUMNS, "sampled, on levels cloned from")
+    head = ("cloned from", "seeds", "core-seconds", *COLUMNS, "sampled, on levels cloned from")
     counts = {name: f"{rates['random']['levels']:,}" for name, rates in results[0]["sealed"].items()}
-    title = f"Share of sealed levels of {size} solved: mean over seeds (least to most)"
+    title = (
+        f"Share of sealed levels of {size} solved; brackets: the least and the most of several seeds, "
+        "of one seed the 95% interval over levels"
+    )
     players = results[0]["sealed"]
     others = [
         [name, *(interval_text(players[levels][name][key]) for levels, key in ((ALL, "once"), (SOLVED, "once"),
                                                                               (SOLVED, "best")))]
         for name in BASELINES
     ]  # fmt: skip
+    settings = "".join(f" `{setting}`" for setting in args.set)
     notes = [
         f"*Of all*: {counts[ALL]} levels, of which some cannot be solved; *of solved*: the {counts[SOLVED]} that are "
         "labelled solved. One attempt at each level, or the best of 8.",
-        f"Each policy took {args.updates:,} updates of 1,024 transitions{', with ' if args.set else ''}"
-        f"{' '.join(f'`{setting}`' for setting in args.set)}. A tenth of the levels that it was cloned from were kept "
-        "from training, for validation. The last column plays at most 1,024 of the levels, that tenth included.",
+        f"Each policy took {args.updates:,} updates{', with' * bool(settings)}{settings}. A tenth of the levels that "
+        "it was cloned from were kept from training, for validation. *Mirrored*: with `mirror=true`. Core-seconds are "
+        "those of the clone, with compiling, reading and validation, and without those of the data. The last column "
+        "plays at most 1,024 of the levels, that tenth included.",
+        f"Points that ten times the levels add to *sampled, of solved*: {'; '.join(gains(results))}.",
     ]
     second = Table(
         ("baseline", "of all", "of solved", "of solved, best of 8"), others,
@@ -90,7 +97,7 @@ def run(args: argparse.Namespace) -> Report:
     )  # fmt: skip
     notes += [f"![Share of levels solved in one attempt, against the number of levels cloned from]({page}.svg)"]
     return Report(
-        "Cloning against the number of levels", results, [Table(head, rows, title), second], notes,
+        f"Cloning against the number of levels: {size}", results, [Table(head, rows, title), second], notes,
         plots={f"{page}.svg": lambda path: draw(path, results)}, page=page,
     )  # fmt: skip
 
@@ -110,7 +117,8 @@ def measured(args: argparse.Namespace, size: str, last: int, mirrored: bool, cou
     words = "--attempts", str(ATTEMPTS)
     sealed = kept(policy / "sealed.json", policy, *words, "--size", size, "--levels", args.measured)
     seen = kept(policy / "seen.json", policy, *words, "--on", args.split, "--where", chosen, "--levels", "1024")
-    return {"levels": count, "mirrored": mirrored, "seed": seed, "sealed": sealed, "seen": seen}
+    return {"levels": count, "mirrored": mirrored, "seed": seed, "sealed": sealed, "seen": seen,
+            "core_seconds": lines_of(policy)[-1]["bc/core_seconds"]}  # fmt: skip
 
 
 def kept(file: Path, *words: Any) -> dict[str, Any]:
@@ -118,6 +126,12 @@ def kept(file: Path, *words: Any) -> dict[str, Any]:
     if not file.exists():
         file.write_text(command("evaluate", *words, "--json"))
     return json.loads(file.read_text())["levels"][0]["of"]
+
+
+def lines_of(policy: Path) -> list[dict[str, float]]:
+    """Return the lines of a run's metrics; none if it has not begun."""
+    file = policy / "metrics.jsonl"
+    return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
 
 
 def command(*words: Any) -> str:
@@ -143,12 +157,29 @@ def timed_command(*words: Any) -> tuple[str, float]:
 def row_of(kind: tuple[bool, int], results: list[dict[str, Any]]) -> list[str]:
     mirrored, count = kind
     ways = [("sealed", *way) for way in COLUMNS.values()] + [("seen", ALL, SAMPLED, "once")]
-    rates = [[each[where][levels][player][key]["rate"] for each in results] for where, levels, player, key in ways]
-    return [f"{count:,}{', mirrored' * mirrored}", str(len(results)), *map(range_text, rates)]
+    rates = [[each[where][levels][player][key] for each in results] for where, levels, player, key in ways]
+    seconds = np.mean([each["core_seconds"] for each in results])
+    return [f"{count:,}{', mirrored' * mirrored}", str(len(results)), f"{seconds:,.0f}", *map(range_text, rates)]
 
 
-def range_text(rates: list[float]) -> str:
-    return f"{np.mean(rates):.1%} ({min(rates):.1%} to {max(rates):.1%})"
+def range_text(rates: list[dict[str, Any]]) -> str:
+    if len(rates) == 1:
+        return interval_text(rates[0])
+    values = [each["rate"] for each in rates]
+    return f"{np.mean(values):.1%} ({min(values):.1%} to {max(values):.1%})"
+
+
+def gains(results: list[dict[str, Any]]) -> list[str]:
+    """Return what more levels add, between each two neighbouring numbers of them."""
+    rates: dict[int, list[float]] = {}
+    for each in results:
+        if not each["mirrored"]:
+            rates.setdefault(each["levels"], []).append(100 * each["sealed"][SOLVED][SAMPLED]["once"]["rate"])
+    means = [(count, float(np.mean(some))) for count, some in sorted(rates.items())]
+    return [
+        f"from {few:,} to {many:,}, {(of_many - of_few) / np.log10(many / few):+.1f}"
+        for (few, of_few), (many, of_many) in itertools.pairwise(means)
+    ]
 
 
 def interval_text(rate: dict[str, Any]) -> str:

@@ -13,8 +13,8 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
 
-from benchmarks.cloning import SAMPLED, command, kept, timed_command
-from benchmarks.learners import ATTEMPTS, RATE, SECONDS, STEPS, add_ways, lines_of, rates_text, slug
+from benchmarks.cloning import SAMPLED, command, kept, lines_of, timed_command
+from benchmarks.learners import ATTEMPTS, RATE, SECONDS, STEPS, add_ways, rates_text, slug
 from benchmarks.plotting import pyplot
 from benchmarks.report import Report, Table
 from levelproof.pipeline.errors import Failure

@@ -17,8 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import training
-from benchmarks.cloning import GREEDY, SAMPLED, command, interval_text, kept
-from benchmarks.learners import lines_of
+from benchmarks.cloning import GREEDY, SAMPLED, command, interval_text, kept, lines_of
 from benchmarks.report import Report, Table
 from levelproof.configs.clone import CloneConfig
 from levelproof.configs.compose import compose_clone

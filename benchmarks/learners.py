@@ -4,14 +4,13 @@ A stopped run resumes: `levelproof train` resumes from its checkpoint, and the f
 """
 
 import argparse
-import json
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks.cloning import SAMPLED, command, interval_text, kept
+from benchmarks.cloning import SAMPLED, command, interval_text, kept, lines_of
 from benchmarks.plotting import pyplot
 from benchmarks.report import Report, Table
 from levelproof.configs.numbers import parse_count
@@ -91,12 +90,6 @@ def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
 def slug(name: str) -> str:
     """Return a name as the files and folders of a benchmark have it."""
     return name.replace(", ", "-").replace(" ", "-").replace(":", "-")
-
-
-def lines_of(policy: Path) -> list[dict[str, float]]:
-    """Return the lines of a run's metrics; none if it has not begun."""
-    file = policy / "metrics.jsonl"
-    return [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
 
 
 def evaluated(args: argparse.Namespace, file: Path, policy: Path | str) -> dict[str, Any]:

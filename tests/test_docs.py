@@ -19,6 +19,7 @@ from levelproof.pipeline.look.gallery.gallery import SITE
 from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.made import played_split
 from tests.quick import jit_once
+from tests.test_commands import run_command, smaller
 
 ROOT = Path(__file__).parent.parent
 INSIDE = {"physics", "levelgen", "experts", "configs", "pipeline", "benchmarks", "tests"}
@@ -71,11 +72,20 @@ def test_python_of_a_page_imports_only_the_levelproof_package(page: Path) -> Non
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("page", NOTEBOOKS, ids=lambda page: page.stem)
-def test_notebook_runs_from_top_to_bottom(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder)
-    cells = json.loads(page.read_text())["cells"]
-    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
-    exec(compile("\n\n".join(code), str(page), "exec"), {"__name__": "__main__"})
+def test_notebook_runs_from_top_to_bottom(
+    page: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Commands, which begin with an exclamation mark, run as those of the guides do."""
+    monkeypatch.chdir(tmp_path)
+    for name, root in {"data": folder, "manifests": ROOT}.items():
+        (tmp_path / name).symlink_to(root / name)
+    names = {"__name__": "__main__"}
+    for cell in json.loads(page.read_text())["cells"]:
+        source = "".join(cell["source"])
+        if source.startswith("!levelproof"):
+            run_command(smaller(source.removeprefix("!")), tmp_path, inline=True)
+        elif cell["cell_type"] == "code":
+            exec(compile(source, str(page), "exec"), names)
 
 
 def test_docs_build_without_a_broken_link(tmp_path: Path) -> None:
