@@ -28,7 +28,10 @@ BENCHMARKS = {  # name: (module, what it measures)
     "late": ("benchmarks.late", "which levels only a long search solves, and how"),
     "prior": ("benchmarks.prior", "what attempts of a policy before the search would find and save"),
     "training": ("benchmarks.training", "env steps/s of rollout, update, and the program that does both"),
-    "networks": ("benchmarks.networks", "multiply-adds of the networks, and env steps/s of training with each"),
+    "networks": (
+        "benchmarks.networks",
+        "multiply-adds of the experts' networks, and env steps/s of training with each",
+    ),
     "kinds": ("benchmarks.kinds", "networks of policies: clones at equal core-seconds, and their FLOP/s"),
     "floor": ("benchmarks.floor", "what each stage of a physics step costs, and the floor of its arithmetic"),
     "scaling": ("benchmarks.scaling", "env steps/s against active contacts, and against bodies"),

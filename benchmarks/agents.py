@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> Report:
         "one: the protocol of the reference (kinetix-env 3.0.2), whose README has the rates of `sfl-paper` and "
         "`sfl-1m-envs`. The reference wrote the levels; ours are played in our engine. Unsolvable levels count, too. "
         "Brackets: 95% intervals over levels; the published rates have none.",
-        "Env steps are those of reinforcement, with the levels.",
+        "Env steps count reinforcement only.",
         *(
             f"`{policy}` also learned from demonstrations, whose env steps are not counted: witnesses of {count:,} "
             "levels."

@@ -36,6 +36,7 @@ BASELINES = (
     "its own expert, 64k",
     "its own expert, 256k",
 )
+PLAIN, MIRRORED, LONGER = "", "mirrored", "twice the updates"  # kinds of clones
 BLUE, GREEN, GREY = "#0072b2", "#009e73", "#777777"
 COLUMNS = {  # of sealed levels: which of them count, who plays, and which of its rates
     "sampled, of all": (ALL, SAMPLED, "once"),
@@ -49,7 +50,8 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("split", type=Path, help="split to clone from, with enough solved levels")
     parser.add_argument("--levels", type=int, nargs="+", default=LEVELS, help="solved levels to clone from")
     parser.add_argument("--seeds", type=int, default=SEEDS, help=f"policies per number of levels (default: {SEEDS})")
-    parser.add_argument("--mirrored", type=int, nargs="*", default=(), help="of --levels, those to clone mirrored, too")
+    parser.add_argument("--mirrored", type=int, nargs="*", default=(), help="numbers of levels to clone mirrored, too")
+    parser.add_argument("--longer", type=int, nargs="*", default=(), help="those to clone with twice the updates, too")
     parser.add_argument("--updates", type=int, default=UPDATES, help=f"updates of each policy (default: {UPDATES})")
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of every clone")
     parser.add_argument("--measured", type=int, default=2048, help="sealed levels to measure on (default: 2048)")
@@ -59,16 +61,17 @@ def register(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> Report:
     table = require_manifest(args.split, ["level_id", "label"]).table
     solved = table["level_id"].to_numpy()[np.array(table["label"].to_pylist()) == "solved"]
-    if max((*args.levels, *args.mirrored)) > len(solved):
+    if max((*args.levels, *args.mirrored, *args.longer)) > len(solved):
         raise UserError(f"{args.split} has {len(solved)} solved levels: choose fewer with --levels.")
     size = name_of(levelproof.open(args.split).size)
     page = "cloning" if size == "s" else f"cloning_{size}"
-    kinds = [*((False, count) for count in args.levels), *((True, count) for count in args.mirrored)]
-    # Seed after seed, so that a run that is stopped leaves whole curves; mirrored, the first one alone
+    counts_of = {PLAIN: args.levels, MIRRORED: args.mirrored, LONGER: args.longer}
+    kinds = [(variant, count) for variant, counts in counts_of.items() for count in counts]
+    # Seed after seed, so that a run that is stopped leaves whole curves; of variants, the first one alone
     runs = [(*kind, seed) for seed in range(args.seeds) for kind in kinds if not (seed and kind[0])]
     with ThreadPoolExecutor(len(own_cores())) as threads:
         results = [*threads.map(lambda one: measured(args, size, int(solved[one[1] - 1]), *one), runs)]
-    rows = [row_of(kind, [each for each in results if (each["mirrored"], each["levels"]) == kind]) for kind in kinds]
+    rows = [row_of(kind, [each for each in results if (each["variant"], each["levels"]) == kind]) for kind in kinds]
     head = ("cloned from", "seeds", "core-seconds", *COLUMNS, "sampled, on levels cloned from")
     counts = {name: f"{rates['random']['levels']:,}" for name, rates in results[0]["sealed"].items()}
     title = (
@@ -79,7 +82,7 @@ def run(args: argparse.Namespace) -> Report:
     others = [
         [name, *(interval_text(players[levels][name][key]) for levels, key in ((ALL, "once"), (SOLVED, "once"),
                                                                               (SOLVED, "best")))]
-        for name in BASELINES
+        for name in BASELINES if name in players[ALL]
     ]  # fmt: skip
     settings = "".join(f" `{setting}`" for setting in args.set)
     notes = [
@@ -102,22 +105,17 @@ def run(args: argparse.Namespace) -> Report:
     )  # fmt: skip
 
 
-def measured(args: argparse.Namespace, size: str, last: int, mirrored: bool, count: int, seed: int) -> dict[str, Any]:
+def measured(args: argparse.Namespace, size: str, last: int, variant: str, count: int, seed: int) -> dict[str, Any]:
     """Clone one policy from the first `count` solved levels, the last of which has id `last`; measure it."""
-    policy = args.folder / f"{size}-{count}-{seed}{'-mirrored' * mirrored}"
+    policy = args.folder / "-".join((size, str(count), str(seed), *variant.split()[:1]))
     chosen = f"label = 'solved' AND level_id <= {last}"
-    settings = (
-        f"where={chosen}",
-        f"train.updates={args.updates}",
-        f"seed={seed}",
-        *["mirror=true"] * mirrored,
-        *args.set,
-    )
+    updates = f"train.updates={args.updates * (2 if variant == LONGER else 1)}"
+    settings = f"where={chosen}", updates, f"seed={seed}", *["mirror=true"] * (variant == MIRRORED), *args.set
     command("clone", args.split, "-o", policy, *settings)
     words = "--attempts", str(ATTEMPTS)
     sealed = kept(policy / "sealed.json", policy, *words, "--size", size, "--levels", args.measured)
     seen = kept(policy / "seen.json", policy, *words, "--on", args.split, "--where", chosen, "--levels", "1024")
-    return {"levels": count, "mirrored": mirrored, "seed": seed, "sealed": sealed, "seen": seen,
+    return {"levels": count, "variant": variant, "seed": seed, "sealed": sealed, "seen": seen,
             "core_seconds": lines_of(policy)[-1]["bc/core_seconds"]}  # fmt: skip
 
 
@@ -154,12 +152,17 @@ def timed_command(*words: Any) -> tuple[str, float]:
         return output.read(), used.ru_utime + used.ru_stime
 
 
-def row_of(kind: tuple[bool, int], results: list[dict[str, Any]]) -> list[str]:
-    mirrored, count = kind
+def row_of(kind: tuple[str, int], results: list[dict[str, Any]]) -> list[str]:
+    variant, count = kind
     ways = [("sealed", *way) for way in COLUMNS.values()] + [("seen", ALL, SAMPLED, "once")]
     rates = [[each[where][levels][player][key] for each in results] for where, levels, player, key in ways]
     seconds = np.mean([each["core_seconds"] for each in results])
-    return [f"{count:,}{', mirrored' * mirrored}", str(len(results)), f"{seconds:,.0f}", *map(range_text, rates)]
+    return [
+        ", ".join([f"{count:,}", variant][: 1 + bool(variant)]),
+        str(len(results)),
+        f"{seconds:,.0f}",
+        *map(range_text, rates),
+    ]
 
 
 def range_text(rates: list[dict[str, Any]]) -> str:
@@ -173,7 +176,7 @@ def gains(results: list[dict[str, Any]]) -> list[str]:
     """Return what more levels add, between each two neighbouring numbers of them."""
     rates: dict[int, list[float]] = {}
     for each in results:
-        if not each["mirrored"]:
+        if not each["variant"]:
             rates.setdefault(each["levels"], []).append(100 * each["sealed"][SOLVED][SAMPLED]["once"]["rate"])
     means = [(count, float(np.mean(some))) for count, some in sorted(rates.items())]
     return [
@@ -192,7 +195,7 @@ def draw(path: Path, results: list[dict[str, Any]]) -> None:
     plt = pyplot()
 
     figure, axes = plt.subplots(figsize=(6, 3.6), layout="constrained")
-    results = [each for each in results if not each["mirrored"]]
+    results = [each for each in results if not each["variant"]]
     counts = sorted({each["levels"] for each in results})
     for where, levels, colour, name in (
         ("seen", ALL, GREEN, "levels cloned from"),

@@ -1,7 +1,7 @@
-"""Cost of the networks: multiply-adds of one env step, and env steps/s of training.
+"""Cost of the experts' networks: multiply-adds of one env step, and env steps/s of training.
 
-The transformer is counted, not built. Its tokens are the floor, movable polygons, circles, joints and thrusters; policy
-and value function share no layers, as in the other networks.
+No expert has a transformer: it is counted here, not trained. Its tokens are the floor, movable polygons, circles,
+joints and thrusters; policy and value function share no layers, as in the other networks.
 """
 
 import argparse
@@ -103,7 +103,7 @@ def run(_: argparse.Namespace) -> Report:
             Table(("size", *names, "transformer with its updates"), rows(counts), "Multiply-adds of one env step"),
             Table(("size", *CONFIGS), rows(speeds), "Env steps/s of a core, training"),
         ],
-        notes=["The transformer is counted, not built."],
+        notes=["No expert has a transformer: it is counted here, not trained."],
     )
 
 

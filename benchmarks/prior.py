@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> Report:
             f"The splits: {commands}. Their labels are those of a procedure that knows no policy. "
             "Levels that are trivial or proved unsolvable are left out.",
             "The attempts are made at all levels that would be searched, and timed without compiling. They would save "
-            "at most the third column of seconds.",
+            "at most the seconds in the third column.",
             "The policy's steps are those of its shortest attempt that reaches the goal, on levels that both solve.",
         ],
     )

@@ -71,7 +71,9 @@ class Run:
     @property
     def made(self) -> str:
         """Sentence on when and where."""
-        machine = "{device}, {cores} cores, {system}".format_map(self.machine)
+        machine = "{device}, {cores} {unit}, {system}".format_map(
+            {**self.machine, "unit": "core" if self.machine["cores"] == 1 else "cores"}
+        )
         sides = [
             f"{side}: {', '.join(f'{name} {x}' for name, x in stack.items())}" for side, stack in self.versions.items()
         ]

@@ -15,10 +15,12 @@ pytestmark = pytest.mark.campaign
 def test_cloning_measures_policies_and_keeps_them(tmp_path: Path) -> None:
     split = played_split(tmp_path / "data")
     solved = require_manifest(split, ["label"]).table["label"].to_pylist().count("solved")
-    words = ["cloning", str(split), "--levels", str(solved), "--seeds", "1", "--updates", "2", "--measured", "8"]
+    words = ["cloning", str(split), "--levels", str(solved), "--seeds", "2", "--updates", "2", "--measured", "8"]
+    words += ["--mirrored", str(solved), "--longer", str(solved)]
     args = parser("cloning").parse_args([*words, "--folder", str(tmp_path / "kept")])
     first = run(args)
-    assert first.tables[0].rows[0][0] == str(solved)
+    names = [str(solved), f"{solved}, mirrored", f"{solved}, twice the updates"]
+    assert [row[:2] for row in first.tables[0].rows] == [[name, n] for name, n in zip(names, "211", strict=True)]
     assert len(first.tables[1].rows) == len(BASELINES)
     for name, draw in first.plots.items():
         draw(tmp_path / name)
