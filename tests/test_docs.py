@@ -38,6 +38,7 @@ NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder as the README's commands leave it: its split, levels of it as files, and a policy."""
     folder = tmp_path_factory.mktemp("reader")
+    (folder / "manifests").symlink_to(ROOT / "manifests")
     split = played_split(folder / "data")
     assert split == folder / "data/128k/s"
     export(split, int(read_manifest(split).level_ids[0]), folder / "level.json")
@@ -77,8 +78,8 @@ def test_notebook_runs_from_top_to_bottom(
 ) -> None:
     """Commands, which begin with an exclamation mark, run as those of the guides do."""
     monkeypatch.chdir(tmp_path)
-    for name, root in {"data": folder, "manifests": ROOT}.items():
-        (tmp_path / name).symlink_to(root / name)
+    for name in ("data", "manifests"):
+        (tmp_path / name).symlink_to(folder / name)
     names = {"__name__": "__main__"}
     for cell in json.loads(page.read_text())["cells"]:
         source = "".join(cell["source"])
