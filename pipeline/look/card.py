@@ -17,7 +17,7 @@ from PIL import Image
 
 from levelproof.configs.compose import name_and_hash
 from levelproof.configs.schema import FROM_RECORDS
-from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.config import RECORD_STEPS, Rule
 from levelproof.experts.labels import Label
 from levelproof.levelgen.pictures.raster import sheet, write_png
 from levelproof.pipeline.errors import UserError
@@ -124,6 +124,7 @@ def _facts(path: str, manifest: Manifest) -> SplitFacts:
         shard_bytes=shard_bytes,
         budget=table.column("budget")[0].as_py(),
         distribution=_distribution(manifest),
+        experts=(manifest.config or {}).get("stop", {}).get("rule") != Rule.NONE,
         config_hash=manifest.config_hash or "",
         stored_as=", ".join(sorted(set[str]().union(*(fragment.densities for fragment in manifest.counting)))),
         made_with=_made_with(table),

@@ -61,6 +61,7 @@ class SplitFacts:
     shard_bytes: int
     budget: str
     distribution: str  # description
+    experts: bool  # whether levels that a search does not decide are trained on
     config_hash: str
     stored_as: str  # densities, as settings name them
     made_with: Sequence[str]  # each stack of versions and device
@@ -218,14 +219,22 @@ def _making(splits: Sequence[SplitFacts]) -> str:
         rows.append(f"| `{split.path}` | {cells} | {'; '.join(split.made_with)} |")
     first = splits[0]
     return (
-        "## How it was made\n\nAs configured, each level was searched for a way to the goal, and a PPO expert of its "
-        "own trained on it for at most the budget's env steps; the manifest's column `witness` (`source` in "
-        "seed files) says where each solution came from. The manifests contain the whole configuration.\n\n"
-        + "\n".join(rows)
-        + "\n\n"
-        "To remake the levels and their experts, or to check every byte and every witness:\n\n"
+        f"## How it was made\n\n{_procedure(splits)} The manifest's column `witness` (`source` in seed files) says "
+        "where each solution came from. The manifests contain the whole configuration.\n\n" + "\n".join(rows) + "\n\n"
+        "To remake the levels and their labels, or to check every byte and every witness:\n\n"
         f"    levelproof regenerate manifest=data/{first.path} budget={first.budget} out=again\n"
         f"    levelproof verify data/{first.path}"
+    )
+
+
+def _procedure(splits: Sequence[SplitFacts]) -> str:
+    trained = [split for split in splits if split.experts]
+    if not trained:
+        return "Each level was searched for a way to the goal; no experts were trained."
+    where = "" if len(trained) == len(splits) else f" in {', '.join(f'`{split.path}`' for split in trained)}"
+    return (
+        f"Each level was searched for a way to the goal, and{where} a PPO expert of its own trained on it, as "
+        "configured, for at most the budget's env steps."
     )
 
 

@@ -136,10 +136,23 @@ def test_card_overwrites_only_cards(dataset: Path, tmp_path: Path, capsys, monke
 def test_size_category_counts_transitions(witnesses: int, words: str) -> None:
     facts = SplitFacts(
         "1M/s", False, "", {"solved": witnesses}, witnesses, witnesses, 256 * witnesses, np.arange(0), 0, 0, "1M", "",
-        "", "", [],
+        True, "", "", [],
     )  # fmt: skip
     header = readme("name", [facts], CardOptions(), [], "0.1.0").split("---\n")[1]
     assert yaml.safe_load(header)["size_categories"] == [words]
+
+
+def test_card_tells_which_splits_had_experts() -> None:
+    def text(*trained: bool) -> str:
+        facts = [
+            SplitFacts(f"1M/{i}", False, "", {"solved": 1}, 1, 1, 1, np.arange(0), 0, 0, "1M", "", each, "", "", [])
+            for i, each in enumerate(trained)
+        ]
+        return readme("name", facts, CardOptions(), [], "0.1.0")
+
+    assert "no experts were trained" in text(False, False)
+    assert "to the goal, and a PPO expert" in text(True)
+    assert "and in `1M/1` a PPO expert of its own" in text(False, True)
 
 
 def test_share_interval_is_wilsons() -> None:
