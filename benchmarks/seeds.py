@@ -9,7 +9,8 @@ import argparse
 import json
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,21 +21,25 @@ import pyarrow.parquet as pq
 import levelproof
 from benchmarks import oracle
 from benchmarks.fresh import LANES, STEPS, in_lanes
+from benchmarks.plotting import pyplot
 from benchmarks.report import Report, Table
+from benchmarks.storage import PUBLISHED
 from levelproof.pipeline.dataset.dataset import EPISODES_AT_ONCE
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.runtime import own_cores, prepare_jax
 from levelproof.pipeline.store.seed.file import seed_files
+from levelproof.pipeline.store.shard import stored_bytes
 
 BATCH = 64
 TRAJECTORIES = 2048  # of the seeds that are read, the first ones
-SEEDS = Path(__file__).parent.parent / "manifests" / "256k" / "s"
+SEEDS = Path(__file__).parent.parent / "manifests" / "16k" / "s"
 OBSERVATION = "symbolic_flat"
+RELEASED, PLOT = "released data", "seeds.svg"
 PUBLISHED_LEVELS, PUBLISHED_BYTES = 11_500_000, 326e9  # solved levels of Kinetix-Offline, and its size
 
 
 def register(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("seeds", type=Path, nargs="?", default=SEEDS, help="seed files (default: manifests/256k/s)")
+    parser.add_argument("seeds", type=Path, nargs="?", default=SEEDS, help="seed files (default: manifests/16k/s)")
     parser.add_argument("--seconds", type=float, default=20.0, help="CPU seconds of each measurement (default: 20)")
     parser.add_argument("--without-reference", action="store_true", help="leave out the reference's reader")
 
@@ -44,18 +49,28 @@ def run(args: argparse.Namespace) -> Report:
     sizes = stored(args.seeds)
     with tempfile.TemporaryDirectory() as folder:
         split = Path(folder, "full", sizes["budget"], sizes["size"])
-        rates, versions = read(args.seeds, Path(folder, "part.parquet"), split, args.seconds, args.without_reference)
+        part = Path(folder, "part.parquet")
+        rates, versions = read(args.seeds, part, split, args.seconds, args.without_reference)
+        kept = bytes_of(part, split)
     solved, other = sizes["solved"], sizes["levels"] - sizes["solved"]
     per_level = sizes["bytes"] / solved
     columns = sorted(sizes["columns"].items(), key=lambda item: -item[1])
     return Report(
         title="Seeds",
-        results=[{"what": "bytes", **sizes}, {"what": "rates", "unit": "transitions/s of a core", **rates}],
+        results=[
+            {"what": "bytes", **sizes, "per_level": kept},
+            {"what": "rates", "unit": "transitions/s of a core", **rates},
+        ],
         tables=[
             Table(
                 ("column", "bytes", "per solved level"),
                 [[name, f"{size:,}", f"{size / solved:.2f}"] for name, size in columns],
                 f"{sizes['levels']:,} levels of {sizes['size']} at {sizes['budget']}, {solved:,} of them solved",
+            ),
+            Table(
+                ("stored as", "bytes per level", "of released data's"),
+                [[name, f"{size:,.0f}", f"{size / kept[RELEASED]:.2%}"] for name, size in kept.items()],
+                f"{TRAJECTORIES:,} of these levels in every density",
             ),
             Table(
                 ("read from", "transitions/s", "trajectories/s", "against Lanes"),
@@ -79,7 +94,11 @@ def run(args: argparse.Namespace) -> Report:
             "`Dataset.read`, whole ones of 256 steps, of which the first episode counts here. The *reference* returns "
             "such records with every array copied, without an observation. *Lanes* plays random actions with "
             "observations, and reads nothing.",
+            f"Bytes per level are those of all files of a split, its manifest included; those of *{RELEASED}* "
+            "256 times the bytes of a transition in its 1M split of this size.",
+            f"![Bytes per solved level on a logarithmic axis: released data, and our densities]({PLOT})",
         ],
+        plots={PLOT: partial(draw, kept)},
         reference=versions,
     )  # fmt: skip
 
@@ -102,6 +121,32 @@ def stored(seeds: Path) -> dict[str, Any]:
     columns["(metadata)"] = total - sum(columns.values())
     facts = {"size": about["size"][0].as_py(), "budget": about["budget"][0].as_py()}
     return facts | {"bytes": total, "levels": levels, "solved": solved, "columns": columns}
+
+
+def bytes_of(part: Path, full: Path) -> dict[str, float]:
+    """Return the bytes of a level in the released data, in a split of each density, and in the seed file `part`."""
+    splits = {"full": full}
+    for density in ("resume", "witness"):
+        splits[density] = full.parents[2] / density / full.parent.name / full.name
+        oracle.run_levelproof("grow", part, "-o", splits[density], f"density={density}", "executor=inline")
+    levels = pq.read_metadata(part).num_rows
+    of_splits = {f"`{density}`": stored_bytes(split) / levels for density, split in splits.items()}
+    return {RELEASED: 256 * PUBLISHED[full.name], **of_splits, "`seed`": part.stat().st_size / levels}
+
+
+def draw(kept: Mapping[str, float], path: Path) -> None:
+    """Plot the bytes of a level as bars on a logarithmic axis."""
+    plt = pyplot()
+    figure, axes = plt.subplots(figsize=(6, 2.0), layout="constrained")
+    names = [name.strip("`") for name in kept]
+    axes.barh(names, [*kept.values()], color=["#777777", *["#0072b2"] * (len(kept) - 1)], height=0.6)
+    for row, size in enumerate(kept.values()):
+        axes.annotate(f"{size:,.0f}", (size, row), xytext=(3, 0), textcoords="offset points", va="center", fontsize=8)
+    axes.set(xscale="log", xlim=(1, 3 * max(kept.values())), xlabel="bytes per level")
+    axes.invert_yaxis()
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, metadata={"Date": None})
+    plt.close(figure)
 
 
 def read(seeds: Path, part: Path, split: Path, seconds: float, alone: bool) -> tuple[dict[str, Any], dict[str, str]]:
