@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from levelproof.pipeline.errors import UserError as UserError
     from levelproof.pipeline.exchange.tables import levels_from as levels_from
     from levelproof.pipeline.store.manifest import read_manifest as read_manifest
+    from levelproof.pipeline.store.seed.packed import witness_text as witness_text
     from levelproof.pipeline.store.shard import EngineDiffers as EngineDiffers
     from levelproof.pipeline.store.shard import Shard as Shard
     from levelproof.pipeline.version import __version__ as __version__
@@ -93,6 +94,7 @@ HOME = {
     "save_policy": "levelproof.experts.networks.saved",
     "starts": "levelproof.levelgen.task.environment",
     "to_gymnax": "levelproof.levelgen.task.to_gymnax",
+    "witness_text": "levelproof.pipeline.store.seed.packed",
     "write_level_file": "levelproof.levelgen.files.level_file",
 }
 __all__ = list(HOME)  # pyright: ignore[reportUnsupportedDunderAll]

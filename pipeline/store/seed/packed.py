@@ -6,16 +6,20 @@ choices. A run of 0 steps lasts until the end of the episode.
 """
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Int
 
 from levelproof.experts.config import RECORD_STEPS
+from levelproof.levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS
 from levelproof.levelgen.task.actions import CHOICES
 
 ENTRIES, CHANGES = len(CHOICES), max(CHOICES)
 MAX_RUN = (255 - ENTRIES) // CHANGES - 1  # env steps; longer runs continue in another byte, without a change
 MAX_BYTES = ENTRIES * (RECORD_STEPS + 1)  # of a witness: each entry changes at every env step
+NAMES = [("", f"motor {k} forward", f"motor {k} backward") for k in range(MOTOR_BINDINGS)]
+NAMES += [("", f"thruster {k} on") for k in range(THRUSTER_BINDINGS)]  # by entry and value
 
 
 def pack_witness(action: Int[np.ndarray, "step 6"], live: Bool[np.ndarray, " 6"]) -> bytes:
@@ -33,6 +37,25 @@ def pack_witness(action: Int[np.ndarray, "step 6"], live: Bool[np.ndarray, " 6"]
             before, length = value, length + 1
         packed.append(ENTRIES + change)
     return bytes(packed)
+
+
+def witness_text(witness: bytes, steps: int) -> str:
+    """Return a packed witness as text: a line for each run of equal actions, such as "0-12: motor 0 forward".
+
+    Args:
+        witness: the column of this name in a seed file.
+        steps: the column `steps_to_goal`.
+
+    Raises:
+        ValueError: it is not a witness of so many env steps.
+    """
+    action = unpack_witnesses([witness], np.array([steps]))[:steps, :, 0]
+    begins = np.flatnonzero(np.concatenate([[True], (action[1:] != action[:-1]).any(1)])).tolist()
+    lines = []
+    for begin, end in pairwise([*begins, steps]):
+        used = ", ".join(NAMES[entry][value] for entry, value in enumerate(action[begin].tolist()) if value)
+        lines.append(f"{begin if end - begin == 1 else f'{begin}-{end - 1}'}: {used or 'nothing'}")
+    return "\n".join(lines)
 
 
 def unpack_witnesses(packed: Sequence[bytes], steps: Int[np.ndarray, " level"]) -> Int[np.ndarray, "256 6 level"]:

@@ -1,6 +1,7 @@
 """Seed files: splits as ids and witnesses, read, grown and exported again without a changed bit."""
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -69,15 +70,43 @@ def test_witnesses_unpack_to_the_actions_that_were_packed() -> None:
         assert not unpacked[len(one) :, :, i].any()
 
 
-def test_the_ten_lines_of_the_guide_decode_a_witness() -> None:
+def guides_decoder() -> Callable[[bytes, int], list[list[int]]]:
     codes = re.findall(r"^```python\n(.*?)^```", Path("docs/seeds.md").read_text(), re.DOTALL | re.MULTILINE)
     (code,) = [each for each in codes if "def actions" in each]
     names: dict[str, Any] = {}
     exec(code, names)
-    rng = np.random.default_rng(1)
+    return names["actions"]
+
+
+def test_the_ten_lines_of_the_guide_decode_a_witness() -> None:
+    decode, rng = guides_decoder(), np.random.default_rng(1)
     for _ in range(100):
         one = episode(rng)
-        assert names["actions"](pack_witness(one, ALL), len(one)) == one.tolist()
+        assert decode(pack_witness(one, ALL), len(one)) == one.tolist()
+
+
+def test_witness_text_says_what_the_guide_decodes() -> None:
+    assert levelproof.witness_text(b"", 1) == "0: nothing"
+    assert levelproof.witness_text(bytes([1, 6 + 3 * 2, 6 + 2, 5, 6 + 1]), 4) == (
+        "0-1: thruster 1 on\n2-3: motor 1 backward, thruster 1 on"
+    )
+    entries = {f"motor {k} {way}": (k, value) for k in range(4) for value, way in ((1, "forward"), (2, "backward"))}
+    entries |= {f"thruster {k} on": (4 + k, 1) for k in range(2)}
+    decode, rng = guides_decoder(), np.random.default_rng(2)
+    for _ in range(100):
+        one = episode(rng)
+        said, before = np.zeros_like(one), -1
+        lines = levelproof.witness_text(packed := pack_witness(one, ALL), len(one)).splitlines()
+        for line in lines:
+            span, _, words = line.partition(": ")
+            first, _, last = span.partition("-")
+            assert int(first) == before + 1
+            before = int(last or first)
+            for word in words.split(", ") if words != "nothing" else ():
+                entry, value = entries[word]
+                said[int(first) : before + 1, entry] = value
+        assert said.tolist() == decode(packed, len(one))
+        assert len(lines) == 1 + (one[1:] != one[:-1]).any(1).sum(), "a run is one line"
 
 
 def test_pack_witness_drops_dead_entries() -> None:
