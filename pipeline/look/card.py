@@ -30,8 +30,10 @@ from levelproof.pipeline.store.files import write
 from levelproof.pipeline.store.layout import SHARDS
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 from levelproof.pipeline.store.named import bytes_named
+from levelproof.pipeline.store.remote import as_typed, is_listed, is_remote, require_folder
 from levelproof.pipeline.store.seed.file import SUFFIX, is_seed
 from levelproof.pipeline.store.shard import stored_bytes
+from levelproof.pipeline.urls import HUB
 from levelproof.pipeline.version import __version__
 
 README = "README.md"
@@ -39,20 +41,33 @@ COLUMNS_READ = ("label", "steps_to_goal", "content_hash", "shard", "budget", "ve
 SAMPLE = 200  # levels of a split in the preview
 SHEET_LEVELS, COLUMNS = 12, 4
 BINS = 32
+HUB_PARTS = 4  # parts of hf://datasets/USER/NAME
 
 
 def card(splits: Sequence[Path], out: Path | None, options: CardOptions) -> None:
-    """Write the card of a dataset of these splits; print its path and the upload command.
+    """Write the card of a dataset of these splits; print its path and how to upload it.
+
+    Args:
+        splits: folders below that of the card, or URLs of one dataset.
+        out: file to write; None: beside the splits, which are folders.
+        options: what no split records.
 
     Raises:
-        UserError: a split is missing or not below the file's folder, or the file exists and is not a card.
+        UserError: a split is missing, not in the dataset or on a server that does not list its files, URLs are given
+            without `out`, or the file exists and is not a card.
         Failure: a split is damaged.
     """
-    out = out or _above(splits[0]) / README
+    root, remote = _above(splits[0]), is_remote(splits[0])
+    if remote and out is None:
+        raise UserError(
+            f"The card of {as_typed(splits[0])} is written on this machine: name its file with -o, as in "
+            f"-o card/{README}."
+        )
+    out = out or root / README
     folder = out.absolute().parent.resolve()
     _require_ours(out)
     _require_plain([out])
-    paths = [_below(folder, split) for split in splits]
+    paths = [_below(root if remote else folder, split) for split in splits]
     manifests = [require_manifest(split, COLUMNS_READ, compact=True) for split in splits]
     facts = [_facts(path, manifest) for path, manifest in zip(paths, manifests, strict=True)]
     with writing_to(out):
@@ -63,17 +78,23 @@ def card(splits: Sequence[Path], out: Path | None, options: CardOptions) -> None
         for split_facts, table in zip(facts, tables, strict=True):
             pq.write_table(table, folder / PREVIEW / f"{split_facts.subset}.parquet", row_group_size=100)
         figures = _draw(folder, facts, tables)
-        name = options.name or (options.repo or folder.name).rpartition("/")[2]
+        name = options.name or (options.repo or (root if remote else folder).name).rpartition("/")[2]
         write(out, readme(name, facts, options, figures, __version__).encode())
     print(f"{out}: the card of {', '.join(paths)}, with {PREVIEW}/ and {FIGURES}/ beside it.")
     if not options.license:
         print("It names no licence: choose one with --license, such as cc-by-4.0 or mit.")
+    if remote:
+        print(f"Next:  put them into {as_typed(root)}")
+        return
     excluded = '--exclude "*.lock" --exclude "*/job.json" --exclude "*/events/*" --exclude "*/.*"'
     print(f"Next:  hf upload {options.repo or 'USER/NAME'} {shlex.quote(str(folder))} . --repo-type dataset {excluded}")
 
 
 def _above(split: Path) -> Path:
-    """Return the folder of a dataset: above `{budget}/`, or that of a seed file."""
+    """Return the folder or URL of a dataset: above `{budget}/`, or that of a seed file; on the hub, the repository."""
+    if is_remote(split):
+        above = split.parent if is_seed(split) else split.parent.parent
+        return Path(*split.parts[:HUB_PARTS]) if split.parts[0] in HUB else above
     whole = split.absolute()
     return whole.parent.parent if whole.is_dir() else whole.parent
 
@@ -93,8 +114,8 @@ def _require_plain(paths: Iterable[Path]) -> None:
 
 
 def _below(folder: Path, split: Path) -> str:
-    """Path of a split relative to the card's folder, which must contain every split."""
-    path = split.absolute().resolve()
+    """Path of a split relative to the dataset's folder or URL, which must contain every split."""
+    path = split if is_remote(split) else split.absolute().resolve()
     if folder not in path.parents:
         raise UserError(f"The split {split} is not below {folder}: put all splits of a dataset into one folder.")
     return path.relative_to(folder).as_posix()
@@ -109,8 +130,9 @@ def _facts(path: str, manifest: Manifest) -> SplitFacts:
         rows = f"{path}/*{SUFFIX}" if split.is_dir() else path
         split_bytes = shard_bytes = bytes_named(split, manifest.shards)
     else:
-        rows, split_bytes = f"{path}/manifest/*.parquet", stored_bytes(split)
-        shard_bytes = stored_bytes(shards) if shards.is_dir() else 0
+        if not is_listed(split):
+            require_folder(split, "measure it for its card")
+        rows, split_bytes, shard_bytes = f"{path}/manifest/*.parquet", stored_bytes(split), stored_bytes(shards)
     return SplitFacts(
         path=path,
         seeds=seeds,

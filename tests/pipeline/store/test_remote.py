@@ -429,9 +429,9 @@ def test_commands_that_read_accept_urls_and_others_refuse_them(bucket: Bucket, s
     assert there == here
     status = [command(["status", str(path)], tmp_path).stdout for path in (S3, split)]
     assert status[0] == status[1].replace(str(split), "s3://bucket/data/s")
-    for words in (["verify", "--repair"], ["card"]):
-        refused = command([words[0], "s3://bucket/data/s", *words[1:]], tmp_path)
-        assert_refused(refused, 2, "copy it with `aws s3 sync` first")
+    refused = command(["verify", "s3://bucket/data/s", "--repair"], tmp_path)
+    assert_refused(refused, 2, "copy it with `aws s3 sync` first")
+    assert_refused(command(["card", "s3://bucket/data/s"], tmp_path), 2, "name its file with -o")
 
 
 def test_forked_processes_are_refused(tmp_path: Path) -> None:
