@@ -23,12 +23,14 @@ from levelproof.pipeline.look.inspect import survey
 from levelproof.pipeline.look.query import RowQuery
 from levelproof.pipeline.look.status import read_status
 from levelproof.pipeline.read.level_files import LevelUnavailable, level_at, levels_below
-from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
+from levelproof.pipeline.read.levels import levels_of
+from levelproof.pipeline.store.fields import arrays_of
+from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, require_manifest
 from levelproof.pipeline.store.origins import Origin
 from levelproof.pipeline.verify.verify import examine
 from tests.experts.search.worlds import switchback
 from tests.pipeline.command import assert_refused, here, run
-from tests.pipeline.made import lasting
+from tests.pipeline.made import assert_same, lasting
 
 pytestmark = pytest.mark.slow
 
@@ -199,6 +201,32 @@ def test_commands_work_on_a_split_of_level_files(once: Path, tmp_path: Path) -> 
     assert "| level files |" in (once / "data/5k/README.md").read_text()
     done = here(["export", str(split), "--format", "parquet", "-o", str(tmp_path / "levels")], tmp_path)
     assert done.stdout.startswith(f"{tmp_path / 'levels'}: 2 levels. "), done.stderr
+
+
+def test_seed_file_of_level_files_grows_to_the_same_levels_without_them(folder: Path, tmp_path: Path) -> None:
+    """Its rows have the content of levels that no id makes."""
+    split, seed, grown = folder / "data/5k/s", tmp_path / "levels.parquet", tmp_path / "5k/s"
+    assert here(["export", str(split), "--format", "seed", "-o", str(seed)], tmp_path).returncode == 0
+    kept = ["level_id", "label", "label_reason", "steps_to_goal", "content_hash", "signature", "file", "shard"]
+    before, true = require_manifest(split, [*kept, "size", "row"]), SIZES["s"]
+    levels = arrays_of(levels_of(before, before.table))
+    for path in (folder / "mine").rglob("*.json"):
+        path.unlink()
+    done = here(["grow", str(seed), "-o", str(grown), "executor=inline"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    for source in (seed, grown):
+        after = require_manifest(source, [*kept, "size", "row"])
+        rows, others = (
+            [row | {"shard": bool(row["shard"]), "row": 0} for row in m.table.to_pylist()] for m in (after, before)
+        )
+        assert rows == others
+        found = levels_of(after, after.table)
+        assert found.size == true
+        assert_same(arrays_of(found), levels)
+    assert not examine(seed).wrong
+    again = tmp_path / "again.parquet"
+    assert here(["export", str(grown), "--format", "seed", "-o", str(again)], tmp_path).returncode == 0
+    assert again.read_bytes() == seed.read_bytes()
 
 
 def test_generate_rejects_wrong_settings_and_folders_of_level_files(folder: Path) -> None:
