@@ -1,7 +1,7 @@
 """Origins of levels that are not sampled from an id: a level file, a record of an imported folder, or a shard.
 
-They are in a shard once they have a witness. A level file's id is derived from its content hash, so its random streams
-do not depend on where the file lies. A record's id is its position in the folder.
+They are in a shard once they have a witness, and in a seed file always. A level file's id is derived from its content
+hash, so its random streams do not depend on where the file lies. A record's id is its position in the folder.
 """
 
 import os
@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.remote import absolute, as_typed
+from levelproof.pipeline.store.seed.file import is_seed
 
 ASKED = ("content_hash", "file", "size", "shard", "row")  # columns that `origin_of` needs
 
@@ -52,15 +53,14 @@ class Origin(NamedTuple):
     split: str = ""  # absolute path of a split with the level
     shard: str = ""  # path below the split; empty: no shard has the level
     row: int = 0
-    level_id: int = 0  # id of the level in the shard
+    level_id: int = 0  # id of the level in the split
 
 
 def origin_of(split: Path, row: Mapping[str, Any]) -> Origin:
-    """Return the origin of a manifest row that has the columns ASKED."""
-    origin = Origin(row["content_hash"], row["file"] or "", row["size"], as_typed(absolute(split)))
-    if not row["shard"]:
-        return origin
-    return origin._replace(shard=row["shard"], row=row["row"], level_id=row["level_id"])
+    """Return the origin of a manifest row that has the columns ASKED and `level_id`."""
+    where, level_id = as_typed(absolute(split)), row["level_id"]
+    origin = Origin(row["content_hash"], row["file"] or "", row["size"], where, level_id=level_id)
+    return origin._replace(shard=row["shard"], row=row["row"]) if row["shard"] else origin
 
 
 def origins_of(split: Path, level_ids: Collection[int]) -> dict[int, Origin]:
@@ -72,7 +72,7 @@ def origins_of(split: Path, level_ids: Collection[int]) -> dict[int, Origin]:
     """
     rows = read_manifest(split, ASKED, list(level_ids)).table.to_pylist()
     origins = {row["level_id"]: origin_of(split, row) for row in rows}
-    files = [origin.file for origin in origins.values() if not origin.shard]
+    files = [] if is_seed(split) else [origin.file for origin in origins.values() if not origin.shard]
     missing = [file for file in files if not place_of(file) and not os.path.isfile(file)]
     if missing:
         more = f" and {len(missing) - 1} more" if missing[1:] else ""

@@ -36,6 +36,8 @@ from levelproof.pipeline.store.fields import arrays_of, same_bits, tree_of, unli
 from levelproof.pipeline.store.formats import FIRST_VERSION
 from levelproof.pipeline.store.origins import RECORD, origin_of
 from levelproof.pipeline.store.provenance import device, versions
+from levelproof.pipeline.store.seed.file import is_seed
+from levelproof.pipeline.store.seed.shard import stored_levels
 from levelproof.pipeline.store.shard import EngineDiffers, Shard
 from levelproof.pipeline.verify.findings import Findings
 
@@ -133,7 +135,7 @@ class Evidence:
         return right
 
     def _load_levels(self, stored: Lanes) -> Level:
-        """Load levels that do not come from ids: from their shards, or from their files if they have none."""
+        """Load levels that do not come from ids: from seeds or shards, or from their files if they are in none."""
         levels = jax.tree.map(np.array, empty_level(size_of(self.recipe.size), len(self.ids)))
         ours = arrays_of(levels, "level/")
 
@@ -143,8 +145,13 @@ class Evidence:
 
         for first in range(0, len(stored), LANES):
             put(*self._read(stored[first : first + LANES], ours))
-        for i in np.flatnonzero([shard is None for shard in self.columns["shard"]]):
+        others = np.flatnonzero([shard is None for shard in self.columns["shard"]])
+        if len(others) and is_seed(self.recipe.split):
+            put(others, arrays_of(stored_levels(self.recipe.split, self.ids[others]), "level/"))
+            return levels
+        for i in others:
             row, lane = {name: values[i] for name, values in self.columns.items()}, np.array([i])
+            row["level_id"] = int(self.ids[i])
             try:
                 put(lane, arrays_of(level_at(origin_of(self.recipe.split, row)), "level/"))
             except Failure as failure:

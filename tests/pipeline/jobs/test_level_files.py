@@ -203,30 +203,32 @@ def test_commands_work_on_a_split_of_level_files(once: Path, tmp_path: Path) -> 
     assert done.stdout.startswith(f"{tmp_path / 'levels'}: 2 levels. "), done.stderr
 
 
-def test_seed_file_of_level_files_grows_to_the_same_levels_without_them(folder: Path, tmp_path: Path) -> None:
-    """Its rows have the content of levels that no id makes."""
-    split, seed, grown = folder / "data/5k/s", tmp_path / "levels.parquet", tmp_path / "5k/s"
+def test_seed_file_of_level_files_has_their_content_and_grows_without_them(tmp_path: Path) -> None:
+    """A split finds a level without a witness by its file alone, so the files come back in between."""
+    write(tmp_path / "mine", TRIVIAL, "a.json")
+    write(tmp_path / "mine", UNSOLVABLE, "b.json")
+    assert here(["generate", "level_files=mine", *WORDS], tmp_path).returncode == 0
+    split, seed, grown = tmp_path / "data/5k/s", tmp_path / "levels.parquet", tmp_path / "grown/5k/s"
     assert here(["export", str(split), "--format", "seed", "-o", str(seed)], tmp_path).returncode == 0
-    kept = ["level_id", "label", "label_reason", "steps_to_goal", "content_hash", "signature", "file", "shard"]
-    before, true = require_manifest(split, [*kept, "size", "row"]), SIZES["s"]
-    levels = arrays_of(levels_of(before, before.table))
-    for path in (folder / "mine").rglob("*.json"):
-        path.unlink()
+    before = require_manifest(split)
+    levels, columns = arrays_of(levels_of(before, before.table)), ["level_id", "label", "content_hash", "file"]
+    shutil.move(tmp_path / "mine", tmp_path / "gone")
     done = here(["grow", str(seed), "-o", str(grown), "executor=inline"], tmp_path)
     assert done.returncode == 0, done.stderr
-    for source in (seed, grown):
-        after = require_manifest(source, [*kept, "size", "row"])
-        rows, others = (
-            [row | {"shard": bool(row["shard"]), "row": 0} for row in m.table.to_pylist()] for m in (after, before)
-        )
-        assert rows == others
-        found = levels_of(after, after.table)
-        assert found.size == true
-        assert_same(arrays_of(found), levels)
-    assert not examine(seed).wrong
-    again = tmp_path / "again.parquet"
-    assert here(["export", str(grown), "--format", "seed", "-o", str(again)], tmp_path).returncode == 0
-    assert again.read_bytes() == seed.read_bytes()
+    again = ["regenerate", f"manifest={seed}", "budget=8k", "out=again", "executor=inline"]
+    assert here(again, tmp_path).returncode == 0
+    after = require_manifest(seed)
+    assert_same(arrays_of(levels_of(after, after.table)), levels)
+    findings = examine(seed)
+    assert (findings.levels, findings.witnesses, findings.wrong) == (2, 1, {})
+    shutil.move(tmp_path / "gone", tmp_path / "mine")
+    for source in (grown, tmp_path / "again/8k/s"):
+        after = require_manifest(source)
+        assert after.table.select(columns).equals(before.table.select(columns))
+        assert_same(arrays_of(levels_of(after, after.table)), levels)
+        assert not examine(source).wrong
+    assert here(["export", str(grown), "--format", "seed", "-o", "again.parquet"], tmp_path).returncode == 0
+    assert (tmp_path / "again.parquet").read_bytes() == seed.read_bytes()
 
 
 def test_generate_rejects_wrong_settings_and_folders_of_level_files(folder: Path) -> None:
