@@ -60,7 +60,9 @@ def evaluated(args: argparse.Namespace, policy: str, on: str, size: str) -> dict
         some = ("--levels", args.levels) if args.levels else ()
         file.write_text(command("evaluate", policy, "--on", on, "--size", size, *some, "--json"))
     (group,) = json.loads(file.read_text())["levels"]
-    steps = [f"{each['env_steps']:,}, {each['levels']['levels']}" for each in history(policy) if "env_steps" in each]
+    steps = [
+        f"{each['env_steps']:,}, {short(each['levels']['levels'])}" for each in history(policy) if "env_steps" in each
+    ]
     facts = {"policy": policy, "on": on, "size": size, "env_steps": "; ".join(steps) or "none"}
     return facts | {"rates": group["of"][ALL], "published": group["published"], "levels": levels_of(group)}
 
@@ -76,6 +78,11 @@ def history(policy: str) -> list[dict[str, Any]]:
     while "start_origin" in origins[0]:
         origins.insert(0, origins[0]["start_origin"])
     return origins
+
+
+def short(levels: str) -> str:
+    """Return what a policy was trained on: the size of a split, whose path says nothing elsewhere, or a curriculum."""
+    return f"a split of {Path(levels).name}" if "/" in levels else levels
 
 
 def levels_of(group: dict[str, Any]) -> int:

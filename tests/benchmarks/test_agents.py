@@ -17,7 +17,7 @@ def test_report_compares_policies_on_published_levels(tmp_path: Path, reference:
     random, handmade = report.tables
     assert [row[0] for row in random.rows] == ["doing nothing", "random", "sticky random", "**builtin:s**"]
     origin = load_policy("builtin:s").origin
-    assert random.rows[-1][1] == f"{origin['env_steps']:,}, {origin['levels']['levels']}"
+    assert random.rows[-1][1] == f"{origin['env_steps']:,}, a split of s"
     assert any("witnesses of 24,389 levels" in note for note in report.notes)
     assert [row[0] for row in handmade.rows] == [row[0] for row in random.rows], "published rates are of all levels"
     assert run(parser("agents").parse_args(words)).results == report.results
