@@ -33,7 +33,8 @@ class Batch:
     Attributes:
         level_id: ids of the levels, int64 [batch].
         first: step of the record at which each window starts, int64 [batch].
-        mask: bool [batch, time]; False for padding, whose steps repeat others.
+        mask: bool [batch, time]; False for padding, whose steps repeat others, and for levels that are left out
+            (`levelproof.open`).
         observation: of the requested type, jax arrays [batch, time, ...] (`symbolic_flat`: float32 [batch, time,
             feature]); None if none was requested.
         action: multi-discrete codes (`levelgen.task.actions`), int32 [batch, time, 6].

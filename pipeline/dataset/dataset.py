@@ -1,18 +1,15 @@
 """The reader of a split for training: trajectories by index, batches, and states to start the environment from."""
 
-import hashlib
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from threading import Lock
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from jaxtyping import Int
 from numpy.typing import ArrayLike
 
@@ -20,38 +17,35 @@ from levelproof.levelgen.level import Level, size_of
 from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.environment import EnvState
 from levelproof.levelgen.task.observe.kinds import ObservationType
-from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.types import Size, State
 from levelproof.pipeline.dataset.batch import Batch, expand_fields, require_steps, state_in, timed_out
 from levelproof.pipeline.dataset.batches import Batches, batches_of
+from levelproof.pipeline.dataset.differing import KEEP, Differing
 from levelproof.pipeline.dataset.episodes import EpisodeBatch, gather_episodes
 from levelproof.pipeline.dataset.observations import observe, parse_observation
 from levelproof.pipeline.dataset.order import EpochOrder
 from levelproof.pipeline.dataset.renamed import renamed
 from levelproof.pipeline.dataset.sources import TrajectorySource
 from levelproof.pipeline.dataset.subsets import check_share, in_subset
+from levelproof.pipeline.dataset.trajectories import TrajectoryRows
 from levelproof.pipeline.dataset.windows import Windows
 from levelproof.pipeline.errors import Failure, UserError
-from levelproof.pipeline.read.levels import rules_of
-from levelproof.pipeline.read.rows import COLUMNS, current_rows, gather_rows, same_positions
-from levelproof.pipeline.read.select import columns_in, select
-from levelproof.pipeline.store.columns import schema_of
+from levelproof.pipeline.read.rows import gather_rows
 from levelproof.pipeline.store.fields import tree_of
-from levelproof.pipeline.store.fragment import FULL
-from levelproof.pipeline.store.manifest import require_manifest
 from levelproof.pipeline.store.named import open_shard
-from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.words import many
 
-ALWAYS_COLUMNS = ("label", "steps_to_goal", *COLUMNS)
 EPISODES_AT_ONCE = 1024  # read together for batches of episodes: many lanes of similar length side by side
 OPEN_SHARDS = 256  # shards whose indices are cached
-T = TypeVar("T")
 ALWAYS_FIELDS = ("record/action", "record/reward", "record/done", "record/goal")
 
 
 def open(
-    path: str | os.PathLike[str], where: str | None = None, columns: Sequence[str] = (), validation: float = 0.1
+    path: str | os.PathLike[str],
+    where: str | None = None,
+    columns: Sequence[str] = (),
+    validation: float = 0.1,
+    differing: str = KEEP,
 ) -> "Dataset":
     """Open the trajectories of a split for training.
 
@@ -63,12 +57,15 @@ def open(
         where: SQL condition on the manifest's columns, such as `label = 'solved' AND steps_to_goal < 64`; None: all.
         columns: manifest columns to include in `Dataset.manifest`, besides those that are always read.
         validation: share of all levels, 0 to 1, that belongs to `subset="validation"`.
+        differing: what to do with levels for which this machine's engine computes other states than the stored ones,
+            or another end of the episode: `keep` them, with one warning of the class `EngineDiffers`; `leave_out`:
+            also set `mask` False in all their steps; `raise` a Failure. `Dataset.differing` lists them.
 
     Raises:
         UserError: the split does not exist, no trajectory meets the condition, or an argument is invalid.
         Failure: the manifest is damaged, or was written by another version.
     """
-    return Dataset(Path(path), where, columns, validation)
+    return Dataset(Path(path), where, columns, validation, differing)
 
 
 class Dataset:
@@ -83,42 +80,37 @@ class Dataset:
         simulates: whether reading simulates, because records are not stored whole.
     """
 
-    def __init__(self, split: Path, where: str | None, columns: Sequence[str], validation: float) -> None:
-        self.split, self._opened_with = split, (split, where, columns, validation)
-        hashed = [] if is_seed(split) else ["content_hash"]  # of seeds on demand: it takes their levels
-        columns = [*hashed, *ALWAYS_COLUMNS, *columns, *columns_in(where)]
-        manifest = require_manifest(split, columns, compact=True)
-        rows = select(manifest.table.filter(pc.is_valid(manifest.table["shard"])), where)  # pyright: ignore[reportAttributeAccessIssue]
-        if not rows.num_rows:
-            what = "has no trajectories yet" if where is None else f"has no trajectories for which {where}"
-            raise UserError(f"The split {split} {what}: `levelproof inspect {split}` shows what it has.")
+    def __init__(
+        self, split: Path, where: str | None, columns: Sequence[str], validation: float, differing: str = KEEP
+    ) -> None:
+        self.split, self._opened_with = split, (split, where, columns, validation, differing)
+        self._validation, self._differing = validation, Differing(split, differing)
         check_share(validation)
-        rows = rows.cast(schema_of(rows.column_names))  # dictionary-encoded only while all rows were in memory
-        self._manifest, self._lock = rows.combine_chunks(), Lock()
-        self._shard = lru_cache(OPEN_SHARDS)(open_shard)
-        self.rules: TaskParams = rules_of(manifest)
-        self.simulates = any(fragment.densities != {*FULL} for fragment in manifest.counting)
+        self._trajectories, self._shard = TrajectoryRows(split, where, columns), lru_cache(OPEN_SHARDS)(open_shard)
+        self.rules, self.simulates = self._trajectories.rules, self._trajectories.simulates
 
     @property
     def manifest(self) -> pa.Table:
         """Manifest rows of the trajectories, a table with one row per index (docs/columns.md)."""
-        return self._manifest
+        return self._trajectories.table
 
-    @cached_property
+    @property
     def content_hashes(self) -> list[str]:
         """Content hashes of the trajectories' levels; of seeds, made from the levels at the first call."""
-        table = self._manifest
-        if "content_hash" not in table.column_names:
-            table = require_manifest(self.split, ["content_hash"], table["level_id"].to_numpy()).table
-        return table["content_hash"].to_pylist()
+        return self._trajectories.content_hashes
+
+    @property
+    def differing(self) -> Int[np.ndarray, " level"]:
+        """Ids, ascending, of the levels read so far whose states differ on this machine from the stored ones."""
+        return self._differing.level_ids
 
     @cached_property
     def size(self) -> Size:
         """Size of all levels."""
-        return size_of(self._manifest["size"][0].as_py())
+        return size_of(self.manifest["size"][0].as_py())
 
     def __len__(self) -> int:
-        return self._manifest.num_rows
+        return len(self._trajectories)
 
     def __getitem__(self, index: int) -> Batch:
         """Read one trajectory, arrays [256, ...], with all fields and the observation `symbolic_flat`.
@@ -162,12 +154,12 @@ class Dataset:
         whole = self._arrays(indices, needed)
         late = timed_out(whole["record/done"], whole["record/goal"], self.rules.max_timesteps)
         arrays = windows.cut(whole | {"record/truncated": late}, starts)
-        level, mask = tree_of(Level, arrays, "level/"), windows.mask(starts)
+        level, level_id = tree_of(Level, arrays, "level/"), self._trajectories.level_ids(indices)
         effective = action_mask(jax.tree.map(lambda x: np.moveaxis(x, 0, -1), level)).T[:, None]
         return Batch(
-            level_id=self._manifest["level_id"].take(pa.array(indices)).to_numpy(),
+            level_id=level_id,
             first=starts,
-            mask=mask,
+            mask=windows.mask(starts) & self._differing.kept(level_id)[:, None],
             observation=observe(kind, level, tree_of(State, arrays, "record/state/")) if kind else None,
             action=arrays["record/action"],
             action_mask=np.broadcast_to(effective, arrays["record/action"].shape),
@@ -250,8 +242,9 @@ class Dataset:
             Failure: the data is damaged.
         """
         kind, chosen = parse_observation(observation), expand_fields(fields, self.size)
-        gather = lambda rows: gather_episodes(self.split, rows, chosen, kind, self._shard)
-        return self._gathered(np.atleast_1d(np.asarray(indices, np.int64)), gather)
+        gather = lambda rows: gather_episodes(self.split, rows, chosen, kind, self._shard, self._differing.note)
+        read = self._trajectories.gathered(np.atleast_1d(np.asarray(indices, np.int64)), gather)
+        return replace(read, mask=read.mask & self._differing.kept(read.level_id)[read.episode])
 
     def episode_batches(
         self,
@@ -276,7 +269,7 @@ class Dataset:
         def load(positions: range) -> list[EpisodeBatch]:
             items, new = order.items(positions)
             read = self.episodes(indices[items], fields, observation)
-            return replace(read, mask=new[read.episode]).parts(batch_size)
+            return replace(read, mask=read.mask & new[read.episode]).parts(batch_size)
 
         together = max(1, EPISODES_AT_ONCE // batch_size)
         settings = self._settings(subset=subset, episodes="first")
@@ -336,10 +329,10 @@ class Dataset:
         fields = expand_fields(["level", "record/state", "record/timestep", "record/last_distance"], self.size)
         return state_in(self._arrays(indices.ravel(), fields), indices, steps)
 
-    @cached_property
+    @property
     def fingerprint(self) -> str:
         """Hash of the level ids: equal for equal selections of trajectories."""
-        return hashlib.sha256(self._manifest["level_id"].to_numpy().tobytes()).hexdigest()[:16]
+        return self._trajectories.fingerprint
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the arguments of `open`: unpickling rereads the manifest."""
@@ -350,12 +343,12 @@ class Dataset:
 
     def _settings(self, **chosen: Any) -> dict[str, Any]:
         """Return what decides the batches of an iterator, besides their order."""
-        return {"trajectories": self.fingerprint, "validation": self._opened_with[-1], **chosen}
+        return {"trajectories": self.fingerprint, "validation": self._validation, **chosen}
 
     def _subset(self, subset: str | None) -> Int[np.ndarray, " index"]:
         if subset is None:
             return np.arange(len(self))
-        indices = np.flatnonzero(in_subset(self.content_hashes, subset, self._opened_with[-1]))
+        indices = np.flatnonzero(in_subset(self.content_hashes, subset, self._validation))
         if not len(indices):
             raise UserError(
                 f"None of the {len(self)} trajectories is in the subset {subset}: pass another validation= to open."
@@ -364,32 +357,8 @@ class Dataset:
 
     def _arrays(self, indices: Int[np.ndarray, " batch"], fields: Sequence[str]) -> dict[str, np.ndarray]:
         """Gather arrays of trajectories by field name, level axis first."""
-        return self._gathered(indices, lambda rows: gather_rows(self.split, rows, fields, self._shard))
-
-    def _gathered(self, indices: Int[np.ndarray, " batch"], gather: Callable[[pa.Table], T]) -> T:
-        """Return what `gather` reads of these manifest rows; follow levels that a seal moved."""
-        if not indices.size or indices.min() < 0 or indices.max() >= len(self):
-            raise UserError(f"There are no trajectories {indices.tolist()}: use indices from 0 to {len(self) - 1}.")
-        while True:
-            manifest = self._manifest
-            try:
-                return gather(manifest.select(COLUMNS).take(pa.array(indices)))
-            except Failure:
-                if not self._relocate(manifest):
-                    raise
-
-    def _relocate(self, manifest: pa.Table) -> bool:
-        """Update shards and rows after a seal; return whether they differ from those of `manifest`."""
-        with self._lock:
-            if self._manifest is not manifest:
-                return True
-            current = current_rows(self.split, manifest)
-            same = same_positions(manifest, current)
-            for name in () if same else ("shard", "row"):
-                at = manifest.schema.get_field_index(name)
-                manifest = manifest.set_column(at, name, current[name].combine_chunks())
-            self._manifest = manifest
-            return not same
+        gather = lambda rows: gather_rows(self.split, rows, fields, self._shard, self._differing.note)
+        return self._trajectories.gathered(indices, gather)
 
 
 def _reopen(opened_with: tuple, fingerprint: str) -> Dataset:

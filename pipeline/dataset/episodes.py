@@ -23,7 +23,7 @@ from levelproof.pipeline.read.rows import Open, parts_of
 from levelproof.pipeline.store.contents import table_for
 from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.seed.shard import SeedEpisodes, SeedShard, play_seeds
-from levelproof.pipeline.store.shard import Part, read_together, report_unlike
+from levelproof.pipeline.store.shard import Part, Report, read_together, report_unlike
 
 STATE, ACTION, REWARD, DONE = "record/state", "record/action", "record/reward", "record/done"
 
@@ -40,7 +40,8 @@ class EpisodeBatch:
         level_id: ids of the levels, int64 [episode].
         steps: lengths of the episodes, env steps, int64 [episode].
         episode: which episode each row belongs to, int64 [row].
-        mask: bool [row]; False for padding (`Dataset.episode_batches`), whose episodes repeat others.
+        mask: bool [row]; False for padding (`Dataset.episode_batches`), whose episodes repeat others, and for levels
+            that are left out (`levelproof.open`).
         observation: of the requested type, [row, ...] (`symbolic_flat`: float32 [row, feature]); None if none was
             requested.
         action: multi-discrete codes (`levelgen.task.actions`), int32 [row, 6].
@@ -81,7 +82,7 @@ class EpisodeBatch:
 
 
 def gather_episodes(
-    split: Path, rows: pa.Table, fields: Sequence[str], kind: ObservationType | None, opened: Open
+    split: Path, rows: pa.Table, fields: Sequence[str], kind: ObservationType | None, opened: Open, report: Report
 ) -> EpisodeBatch:
     """Read the first episodes of manifest rows (with `read.rows.COLUMNS`).
 
@@ -91,9 +92,10 @@ def gather_episodes(
         fields: names of further fields.
         kind: type of the observation; None: none.
         opened: opens a shard, as in `read.rows.gather_rows`.
+        report: called if states differ on this machine from the stored ones.
 
     Raises:
-        Failure: a shard is missing or damaged, or its levels differ from the manifest.
+        Failure: a shard is missing or damaged, or its levels differ from the manifest; or as `report`.
     """
     parts, places = parts_of(split, rows, opened)
     size = parts[0][0].size
@@ -102,9 +104,9 @@ def gather_episodes(
     if all(isinstance(shard, SeedShard) and shard.encoding == parts[0][0].encoding for shard, _ in parts):
         seeds: Any = parts
         made = play_seeds(seeds, places, names, kind)
-        report_unlike(parts, places, np.where(made.wrong, 0, -1), False)
+        report_unlike(parts, places, np.where(made.wrong, 0, -1), report)
     else:
-        made = _cut(parts, places, names, kind)
+        made = _cut(parts, places, names, kind, report)
     episode = np.repeat(np.arange(len(made.steps)), made.steps)
     level = tree_of(Level, made.level, "level/")
     live = action_mask(jax.tree.map(lambda x: np.moveaxis(x, 0, -1), level)).T
@@ -123,11 +125,15 @@ def gather_episodes(
 
 
 def _cut(
-    parts: Sequence[Part], places: Sequence[Sequence[int]], names: Sequence[str], kind: ObservationType | None
+    parts: Sequence[Part],
+    places: Sequence[Sequence[int]],
+    names: Sequence[str],
+    kind: ObservationType | None,
+    report: Report,
 ) -> SeedEpisodes:
     """Read whole records and keep their first episodes."""
     states = [field.name for field in table_for(parts[0][0].size) if kind and field.name.startswith(f"{STATE}/")]
-    arrays = read_together(parts, [*names, *states], places=places)
+    arrays = read_together(parts, [*names, *states], report, places)
     done = arrays[DONE]
     steps = np.where(done.any(1), done.argmax(1) + 1, done.shape[1])
     kept = np.arange(done.shape[1]) < steps[:, None]

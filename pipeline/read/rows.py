@@ -11,7 +11,7 @@ from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.named import open_shard
 from levelproof.pipeline.store.remote import at_once
-from levelproof.pipeline.store.shard import Part, Shard, read_together
+from levelproof.pipeline.store.shard import Part, Report, Shard, read_together, warn_unlike
 
 COLUMNS = ("level_id", "size", "shard", "row")  # required of rows
 
@@ -68,7 +68,11 @@ def same_positions(left: pa.Table, right: pa.Table) -> bool:
 
 
 def gather_rows(
-    split: Path, rows: pa.Table, fields: Iterable[str] | None = None, opened: Open = open_shard
+    split: Path,
+    rows: pa.Table,
+    fields: Iterable[str] | None = None,
+    opened: Open = open_shard,
+    report: Report = warn_unlike,
 ) -> dict[str, np.ndarray]:
     """Gather arrays by field name from the shards that the rows name: level axis FIRST, then time; may be views.
 
@@ -79,12 +83,13 @@ def gather_rows(
         rows: as `read_rows`.
         fields: as `read_rows`.
         opened: opens a shard, given the split, the shard's name and the size of its levels; a cache may replace it.
+        report: called if states differ on this machine from the stored ones.
 
     Raises:
-        Failure: a shard is missing or damaged, or its levels differ from the manifest.
+        Failure: a shard is missing or damaged, or its levels differ from the manifest; or as `report`.
     """
     parts, places = parts_of(split, rows, opened)
-    return read_together(parts, fields, places=places)
+    return read_together(parts, fields, report, places)
 
 
 def parts_of(split: Path, rows: pa.Table, opened: Open = open_shard) -> tuple[list[Part], list[list[int]]]:

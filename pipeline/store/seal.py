@@ -46,7 +46,7 @@ from levelproof.pipeline.store.manifest import (
 from levelproof.pipeline.store.merge import Place, merge_shards
 from levelproof.pipeline.store.publish import publishing
 from levelproof.pipeline.store.remote import is_remote
-from levelproof.pipeline.store.shard import Shard, damaged, read_together, write_shard
+from levelproof.pipeline.store.shard import Shard, damaged, read_together, refuse_unlike, write_shard
 
 ROWS = 100_000  # rows per sealed fragment, roughly; more: fewer files, but more to rewrite when levels are added
 CONVERTED = 256  # levels in memory at a time when their density changes: 300 MB for size l
@@ -266,7 +266,7 @@ def convert(
         some = places[first : first + CONVERTED]
         by_shard = groupby(some, lambda place: place.shard)
         parts = [(Shard(path), [place.row for place in group]) for path, group in by_shard]
-        arrays = {name: np.moveaxis(x, 0, -1) for name, x in read_together(parts, exactly=True).items()}
+        arrays = {name: np.moveaxis(x, 0, -1) for name, x in read_together(parts, report=refuse_unlike).items()}
         encoding, path = replace(parts[0][0].encoding, density=density, key_every=key_every), another()
         write_shard(path, [place.level_id for place in some], arrays, encoding)
         yield [Place(path, row, place.level_id) for row, place in enumerate(some)]

@@ -7,10 +7,10 @@ import json
 import os
 import stat
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import zarr
@@ -190,10 +190,39 @@ class Shard:
 Part = tuple[Shard, Sequence[int]]  # rows of a shard
 
 
+class Unlike(NamedTuple):
+    """Levels of one shard whose states differ on this machine from the stored ones; one or more."""
+
+    shard: Path
+    level_ids: list[int]
+    steps: list[int]  # the first of each that differs
+    read: int  # levels that were read, these included
+
+    def __str__(self) -> str:
+        return (
+            f"On this machine the engine computes states that differ from the stored ones for {len(self.steps)} of "
+            f"{self.read} levels of the shard {self.shard}, for level {self.level_ids[0]} from step {self.steps[0]} on"
+        )
+
+
+Report = Callable[[Sequence[Unlike]], None]  # called if states differ, with one `Unlike` for each shard
+
+
+def warn_unlike(unlike: Sequence[Unlike]) -> None:
+    """Warn, for each shard, that states differ."""
+    for one in unlike:
+        warnings.warn(f"{one}: between key frames, states are this machine's own.", EngineDiffers, stacklevel=4)
+
+
+def refuse_unlike(unlike: Sequence[Unlike]) -> None:
+    """Raise Failure, because states differ."""
+    raise Failure(f"{unlike[0]}: read it with the machine and versions that made it.")
+
+
 def read_together(
     parts: Sequence[Part],
     fields: Iterable[str] | None = None,
-    exactly: bool = False,
+    report: Report = warn_unlike,
     places: Sequence[Sequence[int]] | None = None,
 ) -> dict[str, np.ndarray]:
     """Read named arrays from rows of several shards of one size; level axis FIRST, then time.
@@ -203,12 +232,11 @@ def read_together(
     Args:
         parts: shards, and rows to read from each.
         fields: names to return (default: all).
-        exactly: fail if states that the engine recomputes differ from stored ones, instead of warning.
+        report: called if states that the engine recomputes differ from stored ones.
         places: positions of each part's rows in the result; default: one part after another.
 
     Raises:
-        Failure: a chunk is missing or damaged, or has values that are invalid for this size; or states differ, with
-            `exactly`.
+        Failure: a chunk is missing or damaged, or has values that are invalid for this size; or as `report`.
     """
     wanted = None if fields is None else set(fields)
     table = [field for field in table_for(parts[0][0].size) if wanted is None or field.name in wanted]
@@ -218,13 +246,13 @@ def read_together(
     places = _one_after_another(parts) if places is None else places
     if len(by_encoding) == 1:
         group = parts[0][0].restore(parts, table, places)
-        report_unlike(parts, places, group.unlike, exactly)
+        report_unlike(parts, places, group.unlike, report)
         return group.arrays
     groups = []
     for alike in by_encoding.values():
         members = [parts[i] for i in alike]
         groups.append(members[0][0].restore(members, table, _one_after_another(members)))
-        report_unlike(members, _one_after_another(members), groups[-1].unlike, exactly)
+        report_unlike(members, _one_after_another(members), groups[-1].unlike, report)
     back = np.argsort(np.concatenate([places[i] for alike in by_encoding.values() for i in alike]))
     return {name: np.concatenate([group.arrays[name] for group in groups])[back] for name in groups[0].arrays}
 
@@ -262,20 +290,17 @@ def _one_after_another(parts: Sequence[Part]) -> list[range]:
     return [range(end - len(rows), end) for end, (_, rows) in zip(ends, parts, strict=True)]
 
 
-def report_unlike(parts: Sequence[Part], places: Sequence[Sequence[int]], unlike: np.ndarray, refuse: bool) -> None:
-    """Warn, or with `refuse` fail, if this machine's states differ from the stored ones."""
+def report_unlike(parts: Sequence[Part], places: Sequence[Sequence[int]], unlike: np.ndarray, report: Report) -> None:
+    """Report the levels whose states differ: those with a first such step, not -1, in `unlike`."""
+    found = []
     for (shard, rows), mine in zip(parts, places, strict=True) if (unlike >= 0).any() else ():
-        unlike_here = unlike[np.asarray(mine, int)]
-        if len(wrong := np.flatnonzero(unlike_here >= 0)):
-            first = int(wrong[0])
-            what = (
-                f"On this machine the engine computes states that differ from the stored ones for {len(wrong)} of "
-                f"{len(rows)} levels of the shard {shard.path}, for level {shard.level_ids[rows[first]]} from step "
-                f"{unlike_here[first]} on"
-            )
-            if refuse:
-                raise Failure(f"{what}: read it with the machine and versions that made it.")
-            warnings.warn(f"{what}: between key frames, states are this machine's own.", EngineDiffers, stacklevel=3)
+        steps = unlike[np.asarray(mine, int)]
+        wrong = np.flatnonzero(steps >= 0).tolist()
+        if wrong:
+            ids = [int(shard.level_ids[rows[i]]) for i in wrong]
+            found.append(Unlike(shard.path, ids, steps[wrong].tolist(), len(rows)))
+    if found:
+        report(found)
 
 
 def _named(packed: Mapping[str, np.ndarray], table: Sequence[FieldSpec], size: Size) -> dict[str, np.ndarray]:

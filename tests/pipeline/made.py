@@ -157,12 +157,12 @@ def played_split(folder: Path, held: int = 16, size: str = "s", copies: Sequence
     return path
 
 
-def honest_split(folder: Path, unit: int, units: int, *, experts: bool = False) -> Path:
+def honest_split(folder: Path, unit: int, units: int, *words: str, experts: bool = False) -> Path:
     """Make a split without training whose rows are true: levels are solved if random actions solve them.
 
     With `experts`, each unit stores some, whose files are real but whose content is not.
     """
-    job, ids = made_job(str(folder), "size=s"), np.arange(unit * units)
+    job, ids = made_job(str(folder), "size=s", *words), np.arange(unit * units)
     levels = jax.tree.map(np.asarray, sample_levels(jnp.asarray(ids), SIZES["s"], job.distribution))
     before, failed = decide(levels, job.task)
     action = np.repeat(np.random.default_rng(0).integers(0, 2, (16, 6, len(ids))), 16, axis=0).astype(np.int32)
