@@ -81,12 +81,21 @@ class Dataset:
     """
 
     def __init__(
-        self, split: Path, where: str | None, columns: Sequence[str], validation: float, differing: str = KEEP
+        self,
+        split: Path,
+        where: str | None,
+        columns: Sequence[str],
+        validation: float,
+        differing: str = KEEP,
+        fingerprint: str | None = None,
     ) -> None:
         self.split, self._opened_with = split, (split, where, columns, validation, differing)
         self._validation, self._differing = validation, Differing(split, differing)
         check_share(validation)
-        self._trajectories, self._shard = TrajectoryRows(split, where, columns), lru_cache(OPEN_SHARDS)(open_shard)
+        self._trajectories, self._shard = (
+            TrajectoryRows(split, where, columns, fingerprint),
+            lru_cache(OPEN_SHARDS)(open_shard),
+        )
         self.rules, self.simulates = self._trajectories.rules, self._trajectories.simulates
 
     @property
@@ -362,7 +371,7 @@ class Dataset:
 
 
 def _reopen(opened_with: tuple, fingerprint: str) -> Dataset:
-    data = Dataset(*opened_with)
+    data = Dataset(*opened_with, fingerprint=fingerprint)
     if data.fingerprint != fingerprint:
         raise Failure(f"The split {data.split} no longer has the trajectories that it had: open it again.")
     return data

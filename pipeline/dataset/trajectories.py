@@ -12,6 +12,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Int
 
+from levelproof.levelgen.identity.content import VERSION
+from levelproof.levelgen.identity.keys import SAMPLER_VERSION
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.read.levels import rules_of
@@ -20,7 +22,9 @@ from levelproof.pipeline.read.select import columns_in, select
 from levelproof.pipeline.store.columns import schema_of
 from levelproof.pipeline.store.fragment import FULL
 from levelproof.pipeline.store.manifest import require_manifest
-from levelproof.pipeline.store.seed.file import is_seed
+from levelproof.pipeline.store.mapped import find_table, share_table
+from levelproof.pipeline.store.seed.file import describe_seed, is_seed, name_of_table, seed_files
+from levelproof.pipeline.store.seed.source import LevelSource
 
 ALWAYS_COLUMNS = ("label", "steps_to_goal", *COLUMNS)
 T = TypeVar("T")
@@ -35,18 +39,35 @@ class TrajectoryRows:
         simulates: whether reading simulates, because records are not stored whole.
     """
 
-    def __init__(self, split: Path, where: str | None, columns: Sequence[str]) -> None:
-        """Read the manifest. Arguments and errors as `dataset.open`."""
-        hashed = [] if is_seed(split) else ["content_hash"]  # of seeds on demand: it takes their levels
+    def __init__(self, split: Path, where: str | None, columns: Sequence[str], fingerprint: str | None = None) -> None:
+        """Read the manifest; other arguments and errors as `dataset.open`.
+
+        With the `fingerprint` of the trajectories that another process opened, use the table that it shared, if any.
+        """
+        self._split, self._lock, self._is_seed = split, Lock(), is_seed(split)
+        hashed = [] if self._is_seed else ["content_hash"]  # of seeds on demand: it takes their levels
         columns = [*hashed, *ALWAYS_COLUMNS, *columns, *columns_in(where)]
+        self._kind = f"trajectories with {columns}"
+        found = None if fingerprint is None else self._found(self._kind, fingerprint)
+        if found is None:
+            self._read(where, columns)
+            pa.default_memory_pool().release_unused()  # to read takes several times what is kept
+        else:
+            path = seed_files(split)[0]
+            self.table, self.simulates = found, True
+            self.rules = LevelSource.of(describe_seed(path).fragment.config, path).rules
+
+    def _read(self, where: str | None, columns: Sequence[str]) -> None:
+        """Read the manifest, and share the rows of seeds."""
+        split = self._split
         manifest = require_manifest(split, columns, compact=True)
         rows = select(manifest.table.filter(pc.is_valid(manifest.table["shard"])), where)  # pyright: ignore[reportAttributeAccessIssue]
         if not rows.num_rows:
             what = "has no trajectories yet" if where is None else f"has no trajectories for which {where}"
             raise UserError(f"The split {split} {what}: `levelproof inspect {split}` shows what it has.")
         rows = rows.cast(schema_of(rows.column_names))  # dictionary-encoded only while all rows were in memory
-        self._split, self._lock = split, Lock()
         self.table: pa.Table = rows.combine_chunks()
+        self.table = self._shared(self._kind, self.table)
         self.rules: TaskParams = rules_of(manifest)
         self.simulates = any(fragment.densities != {*FULL} for fragment in manifest.counting)
 
@@ -58,13 +79,34 @@ class TrajectoryRows:
         """Hash of the level ids: equal for equal selections of trajectories."""
         return hashlib.sha256(self.table["level_id"].to_numpy().tobytes()).hexdigest()[:16]
 
-    @cached_property
+    @property
     def content_hashes(self) -> list[str]:
-        """Content hashes of the levels; of seeds, made from the levels at the first call."""
-        table = self.table
-        if "content_hash" not in table.column_names:
-            table = require_manifest(self._split, ["content_hash"], table["level_id"].to_numpy()).table
-        return table["content_hash"].to_pylist()
+        """Content hashes of the levels; of seeds, made from the levels once on a machine."""
+        return self._hashes.to_pylist()
+
+    @cached_property
+    def _hashes(self) -> pa.ChunkedArray:
+        if "content_hash" in self.table.column_names:
+            return self.table["content_hash"]
+        kind = f"content hashes of versions {SAMPLER_VERSION} and {VERSION}"
+        table = self._found(kind, self.fingerprint)
+        if table is None:
+            ids = self.table["level_id"].to_numpy()
+            table = self._shared(kind, require_manifest(self._split, ["content_hash"], ids).table)
+        return table["content_hash"]
+
+    def _found(self, kind: str, fingerprint: str) -> pa.Table | None:
+        """Return a table of these trajectories that another process has shared."""
+        name = self._name(kind, fingerprint)
+        return None if name is None else find_table(name)
+
+    def _shared(self, kind: str, table: pa.Table) -> pa.Table:
+        """Return a table of these trajectories from memory that processes share, if it is large and of seeds."""
+        name = self._name(kind, self.fingerprint)
+        return table if name is None else share_table(name, table)
+
+    def _name(self, kind: str, fingerprint: str) -> str | None:
+        return name_of_table(f"{kind} {fingerprint}", seed_files(self._split)) if self._is_seed else None
 
     def level_ids(self, indices: Int[np.ndarray, " batch"]) -> Int[np.ndarray, " batch"]:
         """Return the ids of levels."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from levelproof.pipeline.store.layout import data_path
 from levelproof.pipeline.store.remote import RemoteFile, is_remote
-from levelproof.pipeline.store.seed.file import file_of, is_seed
+from levelproof.pipeline.store.seed.file import file_of, is_seed, written
 from levelproof.pipeline.store.seed.shard import SeedShard
 from levelproof.pipeline.store.shard import Shard, stored_bytes
 
@@ -20,7 +20,7 @@ def open_shard(split: Path, name: str, size: str) -> Shard:
     if not is_seed(split):
         return Shard(data_path(split, name), size)
     file = file_of(split, name)
-    return _seed_shard(file, size, _written(file))
+    return _seed_shard(file, size, written(file))
 
 
 def bytes_named(split: Path, names: Iterable[str]) -> int:
@@ -31,18 +31,9 @@ def bytes_named(split: Path, names: Iterable[str]) -> int:
 
 
 @lru_cache(maxsize=2)
-def _seed_shard(file: Path, size: str, written: tuple[int, ...] | None) -> SeedShard:
+def _seed_shard(file: Path, size: str, _: tuple[int, ...] | None) -> SeedShard:
     """Open a seed file once until it is `written` again: exports read its rows a block at a time."""
     return SeedShard(file, size)
-
-
-def _written(file: Path) -> tuple[int, ...] | None:
-    """Return what differs once a file is written again; None for a URL, and for a file that is gone."""
-    try:
-        about = file.stat()
-    except OSError:
-        return None
-    return about.st_ino, about.st_size, about.st_mtime_ns
 
 
 def _bytes_of(file: Path) -> int:

@@ -80,23 +80,24 @@ class PieceCache:
         self._added += len(piece) + CHECKSUM
         if self._added > self.most // PARTS:
             self._added = 0
-            self._make_room()
+            make_room(self.folder, self.most)
 
-    def _make_room(self) -> None:
-        """Remove the least recently used pieces, and what killed processes left half-written."""
-        pieces, now = [], time.time()
-        with os.scandir(self.folder) as entries:
-            for entry in entries:
-                with suppress(FileNotFoundError):
-                    about = entry.stat(follow_symlinks=False)
-                    if not entry.name.startswith(".") or now - about.st_mtime > ABANDONED:
-                        pieces.append((about.st_mtime, about.st_size, entry.path))
-        total = sum(size for _, size, _ in pieces)
-        if total <= self.most:
-            return
-        for _, size, path in sorted(pieces):
-            if total <= KEPT_SHARE * self.most:
-                break
+
+def make_room(folder: Path, most: int) -> None:
+    """Above `most` bytes, remove the least recently used files and what killed processes left half-written."""
+    files, now = [], time.time()
+    with os.scandir(folder) as entries:
+        for entry in entries:
             with suppress(FileNotFoundError):
-                os.unlink(path)
-            total -= size
+                about = entry.stat(follow_symlinks=False)
+                if not entry.name.startswith(".") or now - about.st_mtime > ABANDONED:
+                    files.append((about.st_mtime, about.st_size, entry.path))
+    total = sum(size for _, size, _ in files)
+    if total <= most:
+        return
+    for _, size, path in sorted(files):
+        if total <= KEPT_SHARE * most:
+            break
+        with suppress(FileNotFoundError):
+            os.unlink(path)
+        total -= size

@@ -2,7 +2,8 @@
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.labels import WITNESSED, Label, Source
 from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
 from levelproof.pipeline.errors import Failure, UserError
-from levelproof.pipeline.store.bounds import DAMAGE, OtherKind, bounded
+from levelproof.pipeline.store.bounds import DAMAGE, Bounded, OtherKind, bounded
 from levelproof.pipeline.store.formats import CONFIG_KEY, HASH_KEY
 from levelproof.pipeline.store.fragment import Fragment, settings_in
 from levelproof.pipeline.store.layout import MANIFEST
@@ -63,6 +64,27 @@ def file_of(source: Path, name: str) -> Path:
     return source if source.suffix == SUFFIX and not source.is_dir() else source / name
 
 
+def name_of_table(what: str, files: Sequence[Path]) -> str | None:
+    """Name a table of seed files for `store.mapped`; None: a file is behind a URL, or gone."""
+    states = [written(path) for path in files]
+    return None if None in states else f"{what} of {[*zip(map(str, map(Path.absolute, files)), states, strict=True)]}"
+
+
+def describe_seed(path: Path) -> SeedFile:
+    """Read what a seed file says of itself. Raises as `read_seed`."""
+    with _opened(path) as (about, _, _):
+        return about
+
+
+def written(path: Path) -> tuple[int, ...] | None:
+    """Return what differs once a seed file is written again; None for a URL, and for a file that is gone."""
+    try:
+        about = path.stat()
+    except OSError:
+        return None
+    return about.st_ino, about.st_size, about.st_mtime_ns
+
+
 def read_seed(
     path: Path, names: Sequence[str], level_ids: np.ndarray | None = None, compact: bool = False
 ) -> tuple[SeedFile, pa.Table]:
@@ -72,6 +94,15 @@ def read_seed(
         UserError: it is no seed file.
         Failure: it is missing, damaged, or has another version.
     """
+    with _opened(path) as (about, file, stored_as):
+        table = file.read(list(dict.fromkeys(["level_id", *names])), stored_as, level_ids, compact)
+        _check(table)
+        return about, table
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[SeedFile, Bounded, dict[str, str]]]:
+    """Open a seed file; also yield the stored names of its columns. The block's errors are raised as `read_seed`'s."""
     try:
         with bounded(path, SEEDS) as file:
             metadata = file.metadata
@@ -90,9 +121,7 @@ def read_seed(
             ):
                 raise ValueError("its metadata are not those of a seed file")
             fragment = Fragment(path, config_hash, config, {}, file.rows, True, frozenset({STORED}))
-            wanted = list(dict.fromkeys(["level_id", *names]))
-            table = file.read(wanted, VERSIONS[version], level_ids, compact)
-            _check(table)
+            yield SeedFile(fragment, budget, tuple(content)), file, VERSIONS[version]
     except FileNotFoundError:
         raise Failure(f"There is no seed file {path}: `levelproof export SPLIT --format seed` writes one.") from None
     except PermissionError:
@@ -102,7 +131,6 @@ def read_seed(
         raise UserError(f"The file {path} is parquet, but not a seed file: {whole}.") from None
     except DAMAGE as error:
         raise damaged_seed(path, error) from error
-    return SeedFile(fragment, budget, tuple(content)), table
 
 
 def damaged_seed(path: Path, error: Exception) -> Failure:

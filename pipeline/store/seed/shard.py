@@ -1,6 +1,6 @@
 """A seed file as a shard: records are simulated when they are read. Each repeats its first episode."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +17,8 @@ from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.density import Restored
 from levelproof.pipeline.store.fields import arrays_of
 from levelproof.pipeline.store.formats import FIRST_VERSION, Encoding, FieldSpec
-from levelproof.pipeline.store.seed.file import damaged_seed, read_seed, seed_files
+from levelproof.pipeline.store.mapped import find_table, share_table, whole
+from levelproof.pipeline.store.seed.file import damaged_seed, describe_seed, name_of_table, read_seed, seed_files
 from levelproof.pipeline.store.seed.packed import unpack_witnesses
 from levelproof.pipeline.store.seed.source import LevelSource
 from levelproof.pipeline.store.shard import Part, Shard
@@ -37,7 +38,7 @@ class SeedEpisodes(NamedTuple):
 
 
 class SeedShard(Shard):
-    """One seed file, whose rows stay in memory: some twenty bytes each.
+    """One seed file. Its rows take some twenty bytes each; processes share those of a large file (`store.mapped`).
 
     Attributes:
         path: path or URL of the file.
@@ -53,22 +54,37 @@ class SeedShard(Shard):
             Failure: it is missing, damaged or of another size, or this program makes other levels from its ids.
         """
         self.path = path
-        about, rows = read_seed(path, COLUMNS, compact=True)
-        config = about.fragment.config
+        config = describe_seed(path).fragment.config
         self._source = LevelSource.of(config, path)
         self.size = self._source.size
         if size not in (None, name_of(self.size)):
             raise Failure(f"The levels of {path} have size {name_of(self.size)}, but {size} was expected.")
         engine = config.get("engine_version", FIRST_VERSION)
         self.encoding = Encoding("witness", rules=self._source.rules, engine_version=engine)
-        self.level_ids: Any = rows.column("level_id").to_numpy()
-        self.steps: np.ndarray = rows.column("steps_to_goal").fill_null(0).to_numpy()
-        self.checksum: np.ndarray = rows.column("checksum").fill_null(0).to_numpy()
+        rows = self._shared("rows", self._read)
+        self.level_ids: Any = whole(rows.column("level_id")).to_numpy()
+        self.steps: np.ndarray = whole(rows.column("steps_to_goal")).to_numpy()
+        self.checksum: np.ndarray = whole(rows.column("checksum")).to_numpy()
         self.witness: pa.ChunkedArray = rows.column("witness")
+
+    def _read(self) -> pa.Table:
+        rows = read_seed(self.path, COLUMNS, compact=True)[1].drop_columns("label")  # it is only checked
+        for name in ("steps_to_goal", "checksum"):
+            rows = rows.set_column(rows.schema.get_field_index(name), name, rows.column(name).fill_null(0))
+        return rows.replace_schema_metadata(None)
+
+    def _shared(self, what: str, read: Callable[[], pa.Table]) -> pa.Table:
+        """Return a table of this file that another process has shared, or read it and share it."""
+        name = name_of_table(what, [self.path])
+        if name is None:
+            return read()
+        found = find_table(name)
+        return share_table(name, read()) if found is None else found
 
     @cached_property
     def _content(self) -> pa.ChunkedArray:
-        return read_seed(self.path, ["content"])[1].column("content")
+        read = lambda: read_seed(self.path, ["content"])[1].select(["content"]).replace_schema_metadata(None)
+        return self._shared("content", read).column("content")
 
     def levels(self, rows: Sequence[int]) -> Level:
         """Make the levels of these rows: numpy arrays, level axis last.
