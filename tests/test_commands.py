@@ -61,7 +61,7 @@ def run_command(words: list[str], folder: Path, inline: bool) -> None:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with what pages presuppose: splits, level files, a policy, a folder in the reference's format."""
+    """Return a folder with what pages presuppose: splits, level files, a policy, an agent, a folder for Kinetix."""
     folder = tmp_path_factory.mktemp("docs")
     for size, budget in (("s", "3k"), ("s", "4k"), ("s", "5k"), ("s", "6k"), ("m", "5k"), ("m", "6k")):
         run_command(["generate", f"size={size}", f"budget={budget}", f"levels={LEVELS}"], folder, True)
@@ -70,6 +70,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / name).mkdir()
         shutil.copy(folder / "level.json", folder / name)
     run_command(smaller("levelproof clone data/4k/s -o policy"), folder, True)
+    (folder / "agent.py").write_text("def act(observation, live, uniform):\n    return (2 * uniform).astype(int)\n")
     everything = ["--where", "shard IS NOT NULL"]
     run_command(["export", "data/6k/s", "--format", "kinetix", *everything, "-o", "kinetix/6k/s"], folder, True)
     return folder
@@ -80,7 +81,7 @@ def test_commands_of_a_page_run_in_order(page: Path, made: Path, tmp_path: Path)
     (tmp_path / "manifests").symlink_to(ROOT / "manifests")
     for words in commands(page):
         for name in re.findall(
-            r"data/\w+/\w+|kinetix/\w+/\w+|level\.json|\bmine\b|\bhandmade\b|\bpolicy\b", " ".join(words)
+            r"data/\w+/\w+|kinetix/\w+/\w+|level\.json|agent\.py|\bmine\b|\bhandmade\b|\bpolicy\b", " ".join(words)
         ):
             makes = words[0] in ("import", "clone", "train", "distill") and f"-o {name}" in " ".join(words)
             if (made / name).exists() and not (tmp_path / name).exists() and not makes:
