@@ -22,13 +22,13 @@ import levelproof
 from benchmarks import oracle
 from benchmarks.fresh import LANES, STEPS, in_lanes
 from benchmarks.plotting import pyplot
-from benchmarks.report import Report, Table
+from benchmarks.report import RESULTS, Report, Table
 from benchmarks.storage import PUBLISHED
+from levelproof.experts.config import RECORD_STEPS
 from levelproof.pipeline.dataset.dataset import EPISODES_AT_ONCE
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.runtime import own_cores, prepare_jax
 from levelproof.pipeline.store.seed.file import seed_files
-from levelproof.pipeline.store.shard import stored_bytes
 
 BATCH = 64
 TRAJECTORIES = 2048  # of the seeds that are read, the first ones
@@ -51,14 +51,14 @@ def run(args: argparse.Namespace) -> Report:
         split = Path(folder, "full", sizes["budget"], sizes["size"])
         part = Path(folder, "part.parquet")
         rates, versions = read(args.seeds, part, split, args.seconds, args.without_reference)
-        kept = bytes_of(part, split)
+        kept = bytes_of(part, sizes["size"])
     solved, other = sizes["solved"], sizes["levels"] - sizes["solved"]
     per_level = sizes["bytes"] / solved
     columns = sorted(sizes["columns"].items(), key=lambda item: -item[1])
     return Report(
         title="Seeds",
         results=[
-            {"what": "bytes", **sizes, "per_level": kept},
+            {"what": "bytes", **sizes, "per_trajectory": kept},
             {"what": "rates", "unit": "transitions/s of a core", **rates},
         ],
         tables=[
@@ -68,9 +68,9 @@ def run(args: argparse.Namespace) -> Report:
                 f"{sizes['levels']:,} levels of {sizes['size']} at {sizes['budget']}, {solved:,} of them solved",
             ),
             Table(
-                ("stored as", "bytes per level", "of released data's"),
+                ("stored as", "bytes per trajectory", "of released data's"),
                 [[name, f"{size:,.0f}", f"{size / kept[RELEASED]:.2%}"] for name, size in kept.items()],
-                f"{TRAJECTORIES:,} of these levels in every density",
+                f"Trajectories of {sizes['size']} in every density",
             ),
             Table(
                 ("read from", "transitions/s", "trajectories/s", "against Lanes"),
@@ -94,9 +94,11 @@ def run(args: argparse.Namespace) -> Report:
             "`Dataset.read`, whole ones of 256 steps, of which the first episode counts here. The *reference* returns "
             "such records with every array copied, without an observation. *Lanes* plays random actions with "
             "observations, and reads nothing.",
-            f"Bytes per level are those of all files of a split, its manifest included; those of *{RELEASED}* "
-            "256 times the bytes of a transition in its 1M split of this size.",
-            f"![Bytes per solved level on a logarithmic axis: released data, and our densities]({PLOT})",
+            f"Bytes per trajectory: those of *{RELEASED}* are {RECORD_STEPS} times the bytes of a transition in its 1M "
+            f"split of this size; those of `full`, `resume` and `witness` {RECORD_STEPS} times what storage.md "
+            f"measured in a split of the default procedure; those of `seed` are of the first {TRAJECTORIES:,} "
+            "trajectories here, trivial ones included. All but `seed` keep whole records.",
+            f"![Bytes per trajectory on a logarithmic axis: released data, and our densities]({PLOT})",
         ],
         plots={PLOT: partial(draw, kept)},
         reference=versions,
@@ -123,26 +125,28 @@ def stored(seeds: Path) -> dict[str, Any]:
     return facts | {"bytes": total, "levels": levels, "solved": solved, "columns": columns}
 
 
-def bytes_of(part: Path, full: Path) -> dict[str, float]:
-    """Return the bytes of a level in the released data, in a split of each density, and in the seed file `part`."""
-    splits = {"full": full}
-    for density in ("resume", "witness"):
-        splits[density] = full.parents[2] / density / full.parent.name / full.name
-        oracle.run_levelproof("grow", part, "-o", splits[density], f"density={density}", "executor=inline")
-    levels = pq.read_metadata(part).num_rows
-    of_splits = {f"`{density}`": stored_bytes(split) / levels for density, split in splits.items()}
-    return {RELEASED: 256 * PUBLISHED[full.name], **of_splits, "`seed`": part.stat().st_size / levels}
+def bytes_of(part: Path, size: str) -> dict[str, float]:
+    """Return the bytes of a trajectory in the released data, in each density as generated, and in a seed file.
+
+    Splits that grow from seeds would take less than generated ones: the later episodes of their records repeat the
+    first.
+    """
+    witnesses = pq.read_table(part, columns=["witness"])["witness"]
+    count = len(witnesses) - witnesses.null_count
+    rows = [line.strip("| ").split(" | ") for line in (RESULTS / "storage.md").read_text().splitlines()]
+    found = {f"`{row[2]}`": RECORD_STEPS * float(row[3]) for row in rows if row[0] == size and len(row) > 3}
+    return {RELEASED: RECORD_STEPS * PUBLISHED[size], **found, "`seed`": part.stat().st_size / count}
 
 
 def draw(kept: Mapping[str, float], path: Path) -> None:
-    """Plot the bytes of a level as bars on a logarithmic axis."""
+    """Plot the bytes of a trajectory as bars on a logarithmic axis."""
     plt = pyplot()
     figure, axes = plt.subplots(figsize=(6, 2.0), layout="constrained")
     names = [name.strip("`") for name in kept]
     axes.barh(names, [*kept.values()], color=["#777777", *["#0072b2"] * (len(kept) - 1)], height=0.6)
     for row, size in enumerate(kept.values()):
         axes.annotate(f"{size:,.0f}", (size, row), xytext=(3, 0), textcoords="offset points", va="center", fontsize=8)
-    axes.set(xscale="log", xlim=(1, 3 * max(kept.values())), xlabel="bytes per level")
+    axes.set(xscale="log", xlim=(1, 3 * max(kept.values())), xlabel="bytes per trajectory")
     axes.invert_yaxis()
     axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, metadata={"Date": None})

@@ -19,7 +19,9 @@ def test_bytes_add_up_and_every_way_reads(tmp_path: Path) -> None:
     args = parser("seeds").parse_args(["seeds", str(seeds), "--seconds", "0.1", "--without-reference"])
     stored, rates = run(args).results
     assert sum(stored["columns"].values()) == stored["bytes"] == seeds.stat().st_size
-    sizes = [*stored["per_level"].values()]
+    names = ["released data", "`full`", "`resume`", "`witness`", "`seed`"]
+    assert [*stored["per_trajectory"]] == names
+    sizes = [*stored["per_trajectory"].values()]
     assert sizes == sorted(sizes, reverse=True), "each density takes less than the one before"
     labels = require_manifest(split, ["label"]).table["label"].to_pylist()
     assert (stored["levels"], stored["solved"]) == (len(labels), labels.count("solved"))
