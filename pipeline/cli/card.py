@@ -12,7 +12,7 @@ levelproof card data/1M/s data/1M/m --license cc-by-4.0 --repo me/levels"""
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("splits", type=Path, nargs="+", metavar="SPLIT", help=SPLIT)
-    where = "file to write; folders of splits must be below its folder (default: README.md in the one above {budget}/)"
+    where = "file to write (default: README.md in the folder above {budget}/); local splits must be below its folder"
     parser.add_argument("-o", "--out", type=Path, help=where)
     parser.add_argument("--license", metavar="ID", help="the data's licence by its name on the hub, such as cc-by-4.0")
     parser.add_argument("--name", help="the dataset's name (default: that of its folder)")

@@ -48,7 +48,7 @@ class Differing:
             return
         found = (
             "On this machine the engine computes states that differ from the stored ones for "
-            f"{many(len(self.level_ids), 'level')} of {self._split} so far, the first of them level {ids[0]}"
+            f"{many(len(self.level_ids), 'level')} of {self._split} so far, such as level {ids[0]}"
         )
         if self._way == RAISE:
             raise Failure(f"{found}: {WAYS[RAISE]}.")

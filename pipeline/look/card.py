@@ -78,13 +78,13 @@ def card(splits: Sequence[Path], out: Path | None, options: CardOptions) -> None
         for split_facts, table in zip(facts, tables, strict=True):
             pq.write_table(table, folder / PREVIEW / f"{split_facts.subset}.parquet", row_group_size=100)
         figures = _draw(folder, facts, tables)
-        name = options.name or (options.repo or (root if remote else folder).name).rpartition("/")[2]
+        name = options.name or (options.repo or (root if remote else folder).name.partition("@")[0]).rpartition("/")[2]
         write(out, readme(name, facts, options, figures, __version__).encode())
     print(f"{out}: the card of {', '.join(paths)}, with {PREVIEW}/ and {FIGURES}/ beside it.")
     if not options.license:
         print("It names no licence: choose one with --license, such as cc-by-4.0 or mit.")
     if remote:
-        print(f"Next:  put them into {as_typed(root)}")
+        print(f"Next:  copy them to {as_typed(root)}")
         return
     excluded = '--exclude "*.lock" --exclude "*/job.json" --exclude "*/events/*" --exclude "*/.*"'
     print(f"Next:  hf upload {options.repo or 'USER/NAME'} {shlex.quote(str(folder))} . --repo-type dataset {excluded}")
@@ -124,7 +124,7 @@ def _below(folder: Path, split: Path) -> str:
 def _facts(path: str, manifest: Manifest) -> SplitFacts:
     table = manifest.table
     labels = {entry["values"]: entry["counts"] for entry in table.column("label").value_counts().to_pylist()}
-    solved = table.filter(manifest.labels == Label.SOLVED)
+    solved, config = table.filter(manifest.labels == Label.SOLVED), manifest.config or {}
     split, shards, seeds = manifest.split, manifest.split / SHARDS, is_seed(manifest.split)
     if seeds:
         rows = f"{path}/*{SUFFIX}" if split.is_dir() else path
@@ -146,7 +146,8 @@ def _facts(path: str, manifest: Manifest) -> SplitFacts:
         shard_bytes=shard_bytes,
         budget=table.column("budget")[0].as_py(),
         distribution=_distribution(manifest),
-        experts=(manifest.config or {}).get("stop", {}).get("rule") != Rule.NONE,
+        searched=bool(config.get("search", {}).get("env_steps")),
+        experts=config.get("stop", {}).get("rule", Rule.NONE) != Rule.NONE,
         config_hash=manifest.config_hash or "",
         stored_as=", ".join(sorted(set[str]().union(*(fragment.densities for fragment in manifest.counting)))),
         made_with=_made_with(table),

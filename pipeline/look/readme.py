@@ -61,7 +61,8 @@ class SplitFacts:
     shard_bytes: int
     budget: str
     distribution: str  # description
-    experts: bool  # whether levels that a search does not decide are trained on
+    searched: bool  # whether a search is known to have come before any training
+    experts: bool  # whether experts are known to have trained
     config_hash: str
     stored_as: str  # densities, as settings name them
     made_with: Sequence[str]  # each stack of versions and device
@@ -228,14 +229,16 @@ def _making(splits: Sequence[SplitFacts]) -> str:
 
 
 def _procedure(splits: Sequence[SplitFacts]) -> str:
-    trained = [split for split in splits if split.experts]
-    if not trained:
-        return "Each level was searched for a way to the goal; no experts were trained."
-    where = "" if len(trained) == len(splits) else f" in {', '.join(f'`{split.path}`' for split in trained)}"
-    return (
-        f"Each level was searched for a way to the goal, and{where} a PPO expert of its own trained on it, as "
-        "configured, for at most the budget's env steps."
-    )
+    """Say what was searched and what was trained; nothing of splits that do not record it, as imported ones."""
+
+    def among(some: Sequence[SplitFacts]) -> str:
+        return "" if len(some) == len(splits) else f" of {', '.join(f'`{split.path}`' for split in some)}"
+
+    searched, trained = ([split for split in splits if getattr(split, name)] for name in ("searched", "experts"))
+    sentences = [f"Levels{among(searched)} were searched for a way to the goal, as configured."] * bool(searched)
+    own = "had PPO experts of their own, trained for at most the budget's env steps, as configured."
+    sentences += [f"Levels{among(trained)} {own}"] * bool(trained)
+    return " ".join([*sentences, *["No experts were trained."] * (bool(searched) and not trained)])
 
 
 def _licence(options: CardOptions) -> str:

@@ -63,7 +63,8 @@ def _opened(path: Path, name: str) -> pa.Table:
     """Map a file. Raise one of DAMAGE if it is missing, damaged, or has another table."""
     with open(path, "rb", opener=regular) as file:
         if time.time() - os.fstat(file.fileno()).st_mtime > TOUCH_INTERVAL:
-            os.utime(path, follow_symlinks=False)
+            with suppress(OSError):  # a cache folder that may only be read
+                os.utime(path, follow_symlinks=False)
         mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     content = pa.py_buffer(mapped)
     if content.size <= CHECKSUM or _sum(memoryview(content)[:-CHECKSUM]) != mapped[-CHECKSUM:]:
@@ -88,10 +89,24 @@ def _write(path: Path, name: str, table: pa.Table) -> None:
                 checksum = _sum(memoryview(content))
             file.seek(0, os.SEEK_END)
             file.write(checksum)
-        temporary.replace(path)
+        _publish(temporary, path, name, table)
     finally:
         temporary.unlink(missing_ok=True)
     make_room(path.parent, MOST)
+
+
+def _publish(temporary: Path, path: Path, name: str, table: pa.Table) -> None:
+    """Give a written file its name, unless another process was first: all then map one file."""
+    try:
+        os.link(temporary, path)
+        return
+    except FileExistsError:
+        with suppress(*DAMAGE):
+            if _opened(path, name).equals(table):
+                return
+    except OSError:
+        pass  # a file system without hard links
+    temporary.replace(path)
 
 
 def _sum(content: memoryview) -> bytes:

@@ -82,7 +82,7 @@ def written(path: Path) -> tuple[int, ...] | None:
         about = path.stat()
     except OSError:
         return None
-    return about.st_ino, about.st_size, about.st_mtime_ns
+    return about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns
 
 
 def read_seed(

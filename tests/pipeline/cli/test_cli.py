@@ -136,7 +136,7 @@ def test_arguments_may_follow_options(split: Path) -> None:
     done = here(["export", "data/5k/s", "-o", "level.json", str(solved_level(split))], split.parents[2])
     assert done.returncode == 0, done.stderr
     done = here(["plan", "size=s", "--json", "levels=six"], split.parents[2])
-    assert_refused(done, 2, "six")
+    assert_refused(done, 2, "write a whole number")
 
 
 def test_parts_of_a_split_and_impossible_ids_are_named(split: Path) -> None:

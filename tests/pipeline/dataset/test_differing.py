@@ -97,7 +97,7 @@ def test_reading_reports_differing_levels_once(
     assert one.category is levelproof.EngineDiffers
     assert str(one.message).startswith(
         "On this machine the engine computes states that differ from the stored ones for 2 levels of "
-        f"{source} so far, the first of them level {ids[1]}: "
+        f"{source} so far, such as level {ids[1]}: "
     )
 
 
@@ -150,7 +150,7 @@ def test_raise_refuses_differing_levels_each_time(source: Path, ids: list[int], 
     data = levelproof.open(source, differing="raise")
     data.read([0, 2], observation=None)
     for _ in range(2):
-        with pytest.raises(Failure, match=rf"of {source} so far, the first of them level {ids[0]}: read the split"):
+        with pytest.raises(Failure, match=rf"of {source} so far, such as level {ids[0]}: read the split"):
             READS[name](data)
 
 

@@ -136,23 +136,28 @@ def test_card_overwrites_only_cards(dataset: Path, tmp_path: Path, capsys, monke
 def test_size_category_counts_transitions(witnesses: int, words: str) -> None:
     facts = SplitFacts(
         "1M/s", False, "", {"solved": witnesses}, witnesses, witnesses, 256 * witnesses, np.arange(0), 0, 0, "1M", "",
-        True, "", "", [],
+        True, True, "", "", [],
     )  # fmt: skip
     header = readme("name", [facts], CardOptions(), [], "0.1.0").split("---\n")[1]
     assert yaml.safe_load(header)["size_categories"] == [words]
 
 
 def test_card_tells_which_splits_had_experts() -> None:
-    def text(*trained: bool) -> str:
+    def text(*trained: bool, searched: bool = True) -> str:
         facts = [
-            SplitFacts(f"1M/{i}", False, "", {"solved": 1}, 1, 1, 1, np.arange(0), 0, 0, "1M", "", each, "", "", [])
+            SplitFacts(
+                f"1M/{i}", False, "", {"solved": 1}, 1, 1, 1, np.arange(0), 0, 0, "1M", "", searched, each, "", "", []
+            )
             for i, each in enumerate(trained)
         ]
         return readme("name", facts, CardOptions(), [], "0.1.0")
 
-    assert "no experts were trained" in text(False, False)
-    assert "to the goal, and a PPO expert" in text(True)
-    assert "and in `1M/1` a PPO expert of its own" in text(False, True)
+    assert "Levels were searched for a way to the goal, as configured. No experts were trained." in text(False, False)
+    assert "Levels had PPO experts of their own" in text(True)
+    assert "Levels of `1M/1` had PPO experts" in text(False, True)
+    assert "were searched" not in (published := text(True, searched=False))
+    assert "Levels had PPO experts of their own" in published
+    assert "experts" not in text(False, searched=False).partition("## How it was made")[2].partition("## Lic")[0]
 
 
 def test_share_interval_is_wilsons() -> None:

@@ -199,7 +199,7 @@ def carded(words: list[str], folder: Path) -> str:
 def test_card_of_a_seed_file_on_a_web_server_is_that_of_its_folder(published: Path, tmp_path: Path) -> None:
     with serving(files_of(published.parent)) as server:
         url, own = f"{server.url}/levels", ["-o", "levels/README.md"]
-        assert carded([f"{url}/seeds.parquet", *own], tmp_path) == f"Next:  put them into {url}"
+        assert carded([f"{url}/seeds.parquet", *own], tmp_path) == f"Next:  copy them to {url}"
         for words, told in (
             ([f"{url}/seeds.parquet"], "name its file with -o, as in -o card/README"),
             ([f"{url}/128k/s", "-o", "x/README.md"], "copy it with `wget -r` first"),
@@ -217,12 +217,12 @@ def test_card_of_a_split_in_a_store_is_that_of_its_folder(
         for name, value in {**KEYS, "ENDPOINT_URL": server.url}.items():
             monkeypatch.setenv(f"AWS_{name}", value)
         told = carded(["s3://bucket/levels/128k/s", "-o", "s3/README.md"], tmp_path)
-        assert told == "Next:  put them into s3://bucket/levels"
+        assert told == "Next:  copy them to s3://bucket/levels"
     with serving(hub_of(published, "user/name", "secret", page=2)) as server:
         monkeypatch.setenv("HF_ENDPOINT", server.url)
         monkeypatch.setenv("HF_TOKEN", "secret")
         told = carded(["hf://datasets/user/name/128k/s", "-o", "hub/README.md", "--name", "levels"], tmp_path)
-        assert told == "Next:  put them into hf://datasets/user/name"
+        assert told == "Next:  copy them to hf://datasets/user/name"
     carded([str(published / "128k/s")], tmp_path)
     written = [
         {
