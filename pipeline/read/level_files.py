@@ -121,7 +121,11 @@ def levels_at(origins: Sequence[Origin]) -> Level:
     """Load several levels, level axis last. Raises as `level_at`."""
     source = origins[0].split  # of all: a unit's levels come from one place
     if source and is_seed(Path(source)):
-        return stored_levels(Path(source), np.array([origin.level_id for origin in origins]))
+        levels = stored_levels(Path(source), np.array([origin.level_id for origin in origins]))
+        for origin, content_hash in zip(origins, content_hashes(levels), strict=True):
+            if content_hash != origin.content_hash:
+                raise LevelUnavailable(f"{source} was written again: level {origin.level_id} has another content.")
+        return levels
     return jax.tree.map(lambda *lanes: np.concatenate(lanes, -1), *map(level_at, origins))
 
 
