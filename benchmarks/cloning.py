@@ -51,7 +51,9 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--levels", type=int, nargs="+", default=LEVELS, help="solved levels to clone from")
     parser.add_argument("--seeds", type=int, default=SEEDS, help=f"policies per number of levels (default: {SEEDS})")
     parser.add_argument("--mirrored", type=int, nargs="*", default=(), help="numbers of levels to clone mirrored, too")
-    parser.add_argument("--longer", type=int, nargs="*", default=(), help="those to clone with twice the updates, too")
+    parser.add_argument(
+        "--longer", type=int, nargs="*", default=(), help="numbers to clone with twice the updates, too"
+    )
     parser.add_argument("--updates", type=int, default=UPDATES, help=f"updates of each policy (default: {UPDATES})")
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of every clone")
     parser.add_argument("--measured", type=int, default=2048, help="sealed levels to measure on (default: 2048)")
@@ -161,7 +163,7 @@ def row_of(kind: tuple[str, int], results: list[dict[str, Any]]) -> list[str]:
     rates = [[each[where][levels][player][key] for each in results] for where, levels, player, key in ways]
     seconds = np.mean([each["core_seconds"] for each in results])
     return [
-        ", ".join([f"{count:,}", variant][: 1 + bool(variant)]),
+        ", ".join(filter(None, (f"{count:,}", variant))),
         str(len(results)),
         f"{seconds:,.0f}",
         *map(range_text, rates),

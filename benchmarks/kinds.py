@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import training
-from benchmarks.cloning import GREEDY, SAMPLED, command, interval_text, kept, lines_of
+from benchmarks.cloning import ATTEMPTS, GREEDY, SAMPLED, command, interval_text, kept, lines_of
 from benchmarks.report import Report, Table
 from levelproof.configs.clone import CloneConfig
 from levelproof.configs.compose import compose_clone
@@ -38,7 +38,6 @@ from levelproof.pipeline.learn.pool import PartedSplit, read_pool
 from levelproof.pipeline.runtime import own_cores, prepare_jax
 
 FEW, REPEATS, DRAWN = 2, 5, 100  # updates at once, how often, and batches drawn
-ATTEMPTS = 8  # at each sealed level
 EXPERTS, BASELINES = "experts' own", ("random", "sticky random")
 
 
@@ -46,7 +45,7 @@ class Kind(NamedTuple):
     """A network, and how its clone is measured."""
 
     settings: Sequence[str]  # of `levelproof clone`
-    attempts: int = ATTEMPTS
+    attempts: int = ATTEMPTS  # at each sealed level
 
 
 KINDS = {

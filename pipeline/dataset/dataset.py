@@ -92,10 +92,8 @@ class Dataset:
         self.split, self._opened_with = split, (split, where, columns, validation, differing)
         self._validation, self._differing = validation, Differing(split, differing)
         check_share(validation)
-        self._trajectories, self._shard = (
-            TrajectoryRows(split, where, columns, fingerprint),
-            lru_cache(OPEN_SHARDS)(open_shard),
-        )
+        self._trajectories = TrajectoryRows(split, where, columns, fingerprint)
+        self._shard = lru_cache(OPEN_SHARDS)(open_shard)
         self.rules, self.simulates = self._trajectories.rules, self._trajectories.simulates
 
     @property

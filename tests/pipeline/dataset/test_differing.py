@@ -101,6 +101,13 @@ def test_reading_reports_differing_levels_once(
     )
 
 
+def assert_read_thrice(data: Dataset, kept: list[np.ndarray], ids: list[int], way: str) -> None:
+    """Check that three epochs have every level, but those that differ only where they are kept."""
+    every = data.manifest["level_id"].to_pylist()
+    assert sorted(np.concatenate(kept).tolist()) == sorted(3 * [i for i in every if way == "keep" or i not in ids])
+    assert data.differing.tolist() == ids
+
+
 @pytest.mark.parametrize("way", WAYS)
 def test_batches_of_several_epochs_report_once_and_keep_their_shape(
     source: Path, ids: list[int], way: str, warned: list[warnings.WarningMessage]
@@ -108,10 +115,7 @@ def test_batches_of_several_epochs_report_once_and_keep_their_shape(
     data = levelproof.open(source, differing=way)
     batches = [*data.batches(3, seed=1, epochs=3, observation=None)]
     assert {batch.mask.shape for batch in batches} == {(3, 256)}
-    kept = np.concatenate([batch.level_id[batch.mask.all(1)] for batch in batches]).tolist()
-    every = data.manifest["level_id"].to_pylist()
-    assert sorted(kept) == sorted(3 * [i for i in every if way == "keep" or i not in ids])
-    assert data.differing.tolist() == ids
+    assert_read_thrice(data, [batch.level_id[batch.mask.all(1)] for batch in batches], ids, way)
     assert len(warned) == 1
 
 
@@ -122,10 +126,8 @@ def test_episode_batches_of_several_epochs_report_once(
     data = levelproof.open(source, differing=way)
     batches = [*data.episode_batches(3, seed=1, epochs=3, observation=None)]
     assert {len(batch.steps) for batch in batches} == {3}
-    kept = np.concatenate([np.unique(batch.level_id[batch.episode[batch.mask]]) for batch in batches]).tolist()
-    every = data.manifest["level_id"].to_pylist()
-    assert sorted(kept) == sorted(3 * [i for i in every if way == "keep" or i not in ids])
-    assert data.differing.tolist() == ids
+    kept = [np.unique(batch.level_id[batch.episode[batch.mask]]) for batch in batches]
+    assert_read_thrice(data, kept, ids, way)
     assert len(warned) == 1
 
 

@@ -23,6 +23,7 @@ from levelproof.configs.compose import override_of
 from levelproof.configs.convert import plain
 from levelproof.configs.meanings import comments_in
 from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.evaluation import play, play_sampled
 from levelproof.experts.imitation import ImitationConfig, from_motion
 from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind
 from levelproof.levelgen.level import ACTIONS
@@ -82,12 +83,16 @@ def test_validation_levels_are_played(policy: Path, split: Path) -> None:
     names = ("eval/sampled_episode_solve_rate", "eval/sampled_episode_length")
     played = [[numbers[name] for name in names] for numbers in metrics(policy)]
     data = levelproof.open(split, where="label = 'solved'", validation=0.3)
-    held = module.in_subset(data.manifest["content_hash"].to_pylist(), "validation", 0.3)
-    count = min(8, int(held.sum()))
+    held = np.flatnonzero(module.in_subset(data.manifest["content_hash"].to_pylist(), "validation", 0.3))
+    count = len(held)
+    assert count <= 8, "all of them are played"
     for rate, length in played:
         assert 0 <= rate <= 1
         assert rate * count == pytest.approx(round(rate * count))
         assert 1 <= length <= RECORD_STEPS
+    last, ids = levelproof.load_policy(policy), data.manifest["level_id"].to_numpy()[held]
+    again = play(play_sampled(last.network), last.params, data.levels(held), ids, 1, CloneConfig().seed, data.rules)
+    assert played[-1] == pytest.approx([again.solved.mean(), again.env_steps.mean()])
 
 
 def test_curves_are_drawn_beside_the_policy(policy: Path, tmp_path: Path) -> None:
