@@ -14,16 +14,19 @@ from levelproof.configs.compose import compose_job
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.pictures.palette import palette_css
 from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.pipeline.cli.main import main
 from levelproof.pipeline.dataset.sample import SAMPLE
 from levelproof.pipeline.look.gallery.gallery import SITE
 from levelproof.pipeline.store.fields import arrays_of
+from levelproof.pipeline.verify.verify import examine
 
 FOLDER = Path(__file__).parent.parent / "manifests"
 EXAMPLE = FOLDER.parent / "docs" / "example"
 ROWS = pq.read_table(FOLDER / "128k-s.parquet").to_pylist()
 WORLDS = dict(np.load(FOLDER / "128k-s-levels.npz"))
 IDS = np.array([row["level_id"] for row in ROWS])
-SEEDS = sorted(file.parent for file in FOLDER.glob("*/*/part-000.parquet"))
+FILES = sorted(file.parent for file in FOLDER.glob("*/*/part-000.parquet"))
+SEEDS = [folder for folder in FILES if not folder.name.endswith("-handmade")]
 # Turns the warning of a level whose states differ into an error
 strict = pytest.mark.filterwarnings("error::levelproof.EngineDiffers")
 
@@ -79,6 +82,18 @@ def test_every_seed_grows_to_its_checksum(folder: Path) -> None:
     data = levelproof.open(folder)
     steps = [data.episodes(part, observation=None).steps for part in np.array_split(np.arange(len(data)), 16)]
     assert np.array_equal(np.concatenate(steps), data.manifest["steps_to_goal"].to_numpy())
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("folder", sorted({*FILES} - {*SEEDS}), ids=lambda folder: folder.name)
+def test_witnesses_of_handmade_levels_reach_the_goal(folder: Path, tmp_path: Path) -> None:
+    """The levels are in the reference's package, which is fetched."""
+    words = ["export", str(folder), "--format", "seed", "--levels", "handmade", "-o", str(tmp_path / "whole.parquet")]
+    assert main(words) == 0
+    findings = examine(tmp_path / "whole.parquet")
+    assert findings.wrong == {}
+    count = {"s-handmade": 10, "m-handmade": 24, "l-handmade": 40}[folder.name]
+    assert (findings.levels, findings.same_bits) == (count, min(count, 32))
 
 
 @pytest.mark.slow

@@ -117,7 +117,7 @@ def from_document(document: object) -> LevelFile:
     size = Size(*(entry.read(static, name, "static_env_params") for name, entry in layout.COUNTS.items()))
     if size.bodies == FIXED_POLYGONS:
         raise LevelFileError("static_env_params has no room for a body besides the scenery")
-    level = level_from_kinetix(_fields(world, size))
+    level = with_known_bindings(level_from_kinetix(_fields(world, size)))
     _check(level)
     collides: Any = np.asarray(collision_matrix(level.model))
     physics = {ours: layout.RULES[ours].read(params, theirs, "env_params") for ours, theirs in layout.PHYSICS.items()}
@@ -174,6 +174,16 @@ def _fields(world: object, size: Size) -> Fields:
             dtype = {float: np.float32, int: np.int32, bool: np.bool_}[entry.kind]
             fields[_path(kind, name)] = np.array(values, dtype).reshape(1, count, *entry.shape)
     return fields | {"gravity": np.array([layout.GRAVITY.read(world, "gravity", "env_state")], np.float32)}
+
+
+def with_known_bindings(level: Level) -> Level:
+    """Set bindings that no action has to 0 where nothing obeys them: some handmade levels' inactive thrusters."""
+    known = lambda binding, active, count: np.where(active | (binding < count), binding, 0)
+    return replace(
+        level,
+        motor_binding=known(level.motor_binding, level.model.joint_active, MOTOR_BINDINGS),
+        thruster_binding=known(level.thruster_binding, level.model.thruster_active, THRUSTER_BINDINGS),
+    )
 
 
 def flaws(level: Level) -> Iterator[tuple[Any, str, str]]:

@@ -14,7 +14,8 @@ levelproof export data/128k/s --format kinetix -o k    a dataset that Kinetix' r
 levelproof export data/128k/s --format kinetix -o k --where "steps_to_goal < 64"
 levelproof export data/128k/s --format minari -o m     a dataset for offline RL
 levelproof export data/128k/s --format parquet -o t    a table of levels and manifest
-levelproof export data/128k/s --format seed -o s.parquet    some 24 bytes per solved level"""
+levelproof export data/128k/s --format seed -o s.parquet    some 24 bytes per solved level
+levelproof export manifests/256k/s-handmade --format seed --levels handmade -o handmade.parquet"""
 JSON = "json"  # for one level; the other formats take a split
 WHERE = (
     "only levels that meet this condition on the manifest's columns "
@@ -34,10 +35,18 @@ def _parquet(split: Path, where: str | None, out: Path) -> None:
     export_parquet(split, where, out)
 
 
-def _seed(split: Path, where: str | None, out: Path) -> None:
+def _seed(split: Path, where: str | None, out: Path, levels: Path | None = None, with_levels: bool = True) -> None:
+    if levels:
+        if where or not with_levels:
+            raise UserError("--levels adds the levels to a whole seed file: leave out --where and --without-levels.")
+        from levelproof.pipeline.exchange.levels_elsewhere import add_levels
+        from levelproof.pipeline.learn.published import HANDMADE, handmade_folder
+
+        add_levels(split, handmade_folder() if str(levels) == HANDMADE and not levels.exists() else levels, out)
+        return
     from levelproof.pipeline.exchange.seed import export_seed
 
-    export_seed(split, where, out)
+    export_seed(split, where, out, with_levels)
 
 
 def _minari(split: Path, where: str | None, out: Path, actions: str = "multi_discrete") -> None:
@@ -60,6 +69,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--format", choices=(JSON, *FORMATS), default=JSON, help=f"what to write (default: {JSON})")
     parser.add_argument("--where", metavar="SQL", help=WHERE)
     parser.add_argument("--actions", choices=ACTIONS, help=f"encoding of actions for minari (default: {ACTIONS[0]})")
+    parser.add_argument(
+        "--without-levels", action="store_true", help="leave levels that come from files out of a seed file"
+    )
+    parser.add_argument(
+        "--levels", type=Path, metavar="FOLDER",
+        help="level files of the levels that a seed file lacks; handmade: those of the reference",
+    )  # fmt: skip
     parser.add_argument("-o", "--out", type=Path, help=f"file or folder to write (default for {JSON}: level.json)")
 
 
@@ -67,6 +83,8 @@ def run(arguments: argparse.Namespace) -> None:
     split, level_id, where, out = arguments.split, arguments.level_id, arguments.where, arguments.out
     if arguments.actions and arguments.format != "minari":
         raise UserError(f"--actions is for --format minari: leave it out for {arguments.format}.")
+    if (arguments.levels or arguments.without_levels) and arguments.format != "seed":
+        raise UserError("--levels and --without-levels are for --format seed: leave them out, or set it.")
     if arguments.format == JSON:
         if level_id is None or where is not None:
             raise UserError(
@@ -85,4 +103,7 @@ def run(arguments: argparse.Namespace) -> None:
     if out is None:
         kind, name = ("file", "levels.parquet") if arguments.format == "seed" else ("folder", arguments.format)
         raise UserError(f"No output path: name the {kind} to write with -o, as in -o {name}.")
-    FORMATS[arguments.format](split, where, out, *filter(None, [arguments.actions]))
+    more = [arguments.actions] if arguments.actions else []
+    if arguments.format == "seed":
+        more = [arguments.levels, not arguments.without_levels]
+    FORMATS[arguments.format](split, where, out, *more)

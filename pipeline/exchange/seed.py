@@ -1,6 +1,7 @@
 """Export to a seed file: levels as ids, witnesses as the actions of one episode. docs/seeds.md describes it."""
 
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -41,27 +42,34 @@ READ = (
 )  # fmt: skip
 
 
-def export_seed(split: Path, where: str | None, out: Path) -> None:
+def export_seed(split: Path, where: str | None, out: Path, with_levels: bool = True) -> None:
     """Write the levels of `split` that meet the condition (None: all) to a new seed file; print a summary.
 
+    Args:
+        split: a split, or seed files.
+        where: condition on the manifest's columns.
+        out: the new file.
+        with_levels: whether levels that come from files are written; if not, `levels_elsewhere.add_levels` adds them.
+
     Raises:
-        UserError: the split does not exist, the condition is invalid, no level meets it, or `out` exists or is not
-            named as seed files are.
+        UserError: the split does not exist, the condition is invalid, no level meets it, `out` exists or is not
+            named as seed files are, or levels that come from ids should be left out.
         Failure: the split is damaged, or a write fails.
     """
-    if out.suffix != SUFFIX:
-        raise UserError(f"Cannot write {out}: the name of a seed file must end in {SUFFIX}, as in -o levels{SUFFIX}.")
-    if out.exists():
-        raise UserError(f"{out} already exists: name a new file with -o, or remove that one.")
+    check_new_seed(out)
     manifest = require_manifest(split, [*READ, *columns_in(where)], compact=True)
     rows = select(manifest.table, where)
     if not rows.num_rows:
         raise UserError(f"No level of {split} meets the condition {where}: choose another one with --where.")
+    if not with_levels:
+        if not from_files(manifest.config or {}):
+            raise UserError(f"The levels of {as_typed(split)} are sampled from their ids: leave out --without-levels.")
+        rows = rows.set_column(rows.schema.get_field_index("file"), "file", [_below_one_folder(rows.column("file"))])
     prepare_jax()
     config = {**(manifest.config or {}), **REPEATED}
     with writing_to(out):
         firsts = with_bar(range(0, rows.num_rows, ROW_GROUP), "row groups")
-        groups = (_group(manifest, rows.slice(first, ROW_GROUP)) for first in firsts)
+        groups = (_group(manifest, rows.slice(first, ROW_GROUP), with_levels) for first in firsts)
         data = seed_bytes(groups, config, rows["budget"][0].as_py())
         files.write(out, data)
     solved = manifest.counts(np.isin(manifest.level_ids, rows["level_id"].to_numpy())).get(Label.SOLVED, 0)
@@ -70,7 +78,22 @@ def export_seed(split: Path, where: str | None, out: Path) -> None:
     print(f'Next:  levelproof.open("{out}")')
 
 
-def _group(manifest: Manifest, rows: pa.Table) -> tuple[pa.Table, list[str]]:
+def check_new_seed(out: Path) -> None:
+    """Raise UserError unless `out` can be the path of a new seed file."""
+    if out.suffix != SUFFIX:
+        raise UserError(f"Cannot write {out}: the name of a seed file must end in {SUFFIX}, as in -o levels{SUFFIX}.")
+    if out.exists():
+        raise UserError(f"{out} already exists: name a new file with -o, or remove that one.")
+
+
+def _below_one_folder(file: pa.ChunkedArray) -> pa.Array:
+    """Return the paths of level files below the folder that all of them are in."""
+    paths = file.to_pylist()
+    folder = os.path.commonpath([os.path.dirname(path) for path in paths])
+    return pa.array([os.path.relpath(path, folder) for path in paths], pa.string())
+
+
+def _group(manifest: Manifest, rows: pa.Table, with_levels: bool) -> tuple[pa.Table, list[str]]:
     """Return a row group, and the content hashes of its levels."""
     columns: dict[str, Any] = {name: rows.column(name) for name in ("level_id", *KEPT)}
     columns |= {"source": rows.column("witness"), "label_reason": _reasons(rows), "made_with": _made_with(rows)}
@@ -81,7 +104,8 @@ def _group(manifest: Manifest, rows: pa.Table) -> tuple[pa.Table, list[str]]:
         witness[some], checksum[some] = _witnesses(manifest, rows.take(some))
     columns["witness"] = pa.array(witness.tolist(), pa.binary())
     columns["checksum"] = pa.array(checksum, mask=~rows.column("shard").is_valid().to_numpy())
-    columns["content"] = pa.array(list(_content(manifest, rows)), pa.binary())
+    content = _content(manifest, rows) if with_levels else [None] * rows.num_rows
+    columns["content"] = pa.array(list(content), pa.binary())
     table = pa.table({name: _plain(columns[name]) for name in SCHEMA.names}, schema=SCHEMA)
     return table, rows.column("content_hash").to_pylist()
 

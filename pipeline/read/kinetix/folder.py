@@ -11,7 +11,7 @@ from jaxtyping import Int
 
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.levelgen.files.kinetix import Fields, level_from_kinetix
-from levelproof.levelgen.files.level_file import flaws
+from levelproof.levelgen.files.level_file import flaws, with_known_bindings
 from levelproof.levelgen.level import ACTIONS, MAX_PER_KIND, Level, name_of
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.physics.types import FIXED_POLYGONS, Size
@@ -94,7 +94,7 @@ def read_trajectories(array: StoredArray, first: int, last: int) -> Trajectories
     wrong = [""] * count
     for i, reason in _invalid_values(fields, action):
         wrong[i] = reason
-    level = level_from_kinetix({name: _convertible(column) for name, column in fields.items()})
+    level = with_known_bindings(level_from_kinetix({name: _convertible(column) for name, column in fields.items()}))
     for i, reason in _invalid_levels(level):
         wrong[i] = wrong[i] or reason
     return Trajectories(level, np.moveaxis(action, 0, -1).astype(np.int32), wrong)

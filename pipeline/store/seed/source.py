@@ -19,7 +19,7 @@ from levelproof.levelgen.sampling.distribution import Distribution
 from levelproof.levelgen.sampling.sampler import CHUNK, check_size, sample_chunk
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.types import Size
-from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.store.formats import FIRST_VERSION
 from levelproof.pipeline.store.seed.worlds import unpack_worlds
 
@@ -28,6 +28,7 @@ from levelproof.pipeline.store.seed.worlds import unpack_worlds
 class LevelSource:
     """What makes the levels of a seed file from its rows, and the rules by which they are played."""
 
+    path: Path
     size: Size
     distribution: Distribution | None  # None: each row has its level's content
     rules: TaskParams
@@ -59,7 +60,7 @@ class LevelSource:
                 f"The levels of {path} were sampled by version {sampler!r:.9} of the sampler, and this "
                 f"program makes those of version {SAMPLER_VERSION}: use the levelproof that wrote it."
             )
-        return LevelSource(size, distribution, rules)
+        return LevelSource(path, size, distribution, rules)
 
     def levels(self, level_ids: Int[np.ndarray, " level"], content: Sequence[bytes | None]) -> Level:
         """Make levels: numpy arrays, level axis last.
@@ -69,11 +70,15 @@ class LevelSource:
             content: packed levels, if there is no distribution.
 
         Raises:
-            ValueError: a content is missing or invalid.
+            UserError: the file was written without its levels.
+            ValueError: a content is invalid.
         """
         if self.distribution is None:
             if any(one is None for one in content):
-                raise ValueError("it lacks the content of a level that is not sampled from its id")
+                raise UserError(
+                    f"The seed file {self.path} does not contain its levels: add them from their level files with "
+                    f"`levelproof export {self.path} --format seed --levels FOLDER -o whole.parquet`."
+                )
             return unpack_worlds([one for one in content if one is not None], self.size)
         ids = np.asarray(level_ids, np.int32)
         lanes = block_size(len(ids), CHUNK)

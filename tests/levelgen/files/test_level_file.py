@@ -216,11 +216,13 @@ def test_reader_refuses_malformed_bindings_of_any_actuator(kind: str, binding: o
         from_document(altered)
 
 
-def test_reader_accepts_unknown_bindings_of_inactive_actuators() -> None:
-    """Two thrusters of the reference's own levels have such bindings."""
-    altered = changed("env_state.thruster.0.thruster_binding", 3)
-    altered["env_state"]["thruster"][0]["active"] = False
-    assert from_document(altered).level.thruster_binding[0, 0] == 3
+def test_reader_zeroes_unknown_bindings_of_inactive_actuators() -> None:
+    """Two thrusters of the reference's own levels have such bindings, which no shard may have."""
+    for kind, name, most in ("thruster", "thruster", 1), ("joint", "motor", 3):
+        for binding, read in (most, most), (most + 1, 0), (255, 0):
+            altered = changed(f"env_state.{kind}.0.{name}_binding", binding)
+            altered["env_state"][kind][0]["active"] = False
+            assert getattr(from_document(altered).level, f"{name}_binding")[0, 0] == read
 
 
 def test_reader_refuses_a_size_without_room_for_bodies() -> None:

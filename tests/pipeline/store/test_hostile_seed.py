@@ -123,7 +123,6 @@ CHANGES: dict[str, Callable[[Table, dict[bytes, Any]], Any]] = {
     "a billion steps per action": with_setting("task", {"frame_skip": 10**9}),
     "distribution of another kind": with_setting("distribution", [1, 2]),
     "another sampler": with_setting("sampler_version", 10**6),
-    "content that is none": with_setting("distribution", "files"),
 }
 
 

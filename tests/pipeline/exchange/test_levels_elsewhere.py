@@ -1,0 +1,148 @@
+"""Seed files without their levels: labels and witnesses by content hash, and the levels added again."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+import levelproof
+from levelproof.configs.schema import FROM_FILES
+from levelproof.levelgen.files.level_file import LevelFile, write_level_file
+from levelproof.levelgen.identity.content import content_hashes, level_id_for
+from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.rules import DEFAULT_RULES
+from levelproof.pipeline.cli.main import main
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.exchange.levels_elsewhere import add_levels
+from levelproof.pipeline.exchange.seed import export_seed
+from levelproof.pipeline.store.manifest import read_manifest
+from levelproof.pipeline.store.seed.columns import SCHEMA
+from levelproof.pipeline.store.seed.worlds import pack_worlds
+from levelproof.pipeline.store.seed.write import seed_bytes
+from levelproof.pipeline.verify.verify import examine
+from tests.pipeline.made import honest_split
+
+COUNT = 16
+
+
+def one(levels: Level, i: int) -> Level:
+    return jax.tree.map(lambda x: np.asarray(x)[..., i : i + 1], levels)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Level files, one of them of another size, one no level."""
+    folder = tmp_path_factory.mktemp("files")
+    levels = sample_levels(np.arange(COUNT), SIZES["s"])
+    for i in range(COUNT):
+        path = folder / "some" / f"level-{i}.json"
+        path.parent.mkdir(exist_ok=True)
+        write_level_file(LevelFile(one(levels, i), DEFAULT_RULES), path)
+    write_level_file(LevelFile(one(sample_levels(np.arange(1), SIZES["m"]), 0), DEFAULT_RULES), folder / "m.json")
+    (folder / "other.json").write_text("{}")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the seed file that a job on the level files would have exported: their rows and witnesses are true."""
+    path = tmp_path_factory.mktemp("whole") / "whole.parquet"
+    split = honest_split(path.parent / "data", COUNT, 1)
+    export_seed(split, None, path.parent / "sampled.parquet")
+    columns: dict[str, Any] = pq.read_table(path.parent / "sampled.parquet").to_pydict()
+    levels = sample_levels(np.arange(COUNT), SIZES["s"])
+    hashes = content_hashes(levels)
+    columns["level_id"] = [level_id_for(one) for one in hashes]
+    columns["content"] = pack_worlds(levels)
+    columns["file"] = [str(folder / "some" / f"level-{i}.json") for i in range(COUNT)]
+    order = np.argsort(columns["level_id"])
+    table = pa.table(columns, schema=SCHEMA).take(order)
+    config = {**(read_manifest(split, []).config or {}), "distribution": FROM_FILES}
+    path.write_bytes(seed_bytes([(table, [hashes[i] for i in order])], config, "128k"))
+    return path
+
+
+@pytest.fixture(scope="module")
+def lacking(whole: Path) -> Path:
+    path = whole.parent / "lacking.parquet"
+    assert main(["export", str(whole), "--format", "seed", "--without-levels", "-o", str(path)]) == 0
+    return path
+
+
+def test_file_without_levels_keeps_everything_else(whole: Path, lacking: Path) -> None:
+    table, before = pq.read_table(lacking), pq.read_table(whole)
+    assert table.column("content").null_count == COUNT
+    others = [name for name in SCHEMA.names if name not in ("content", "file")]
+    assert table.select(others).equals(before.select(others))
+    assert sorted(table.column("file").to_pylist()) == sorted(f"level-{i}.json" for i in range(COUNT))
+    assert lacking.stat().st_size < whole.stat().st_size
+
+
+def test_levels_are_added_again_from_files_of_any_name(
+    whole: Path, lacking: Path, folder: Path, tmp_path: Path
+) -> None:
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    for i, path in enumerate(sorted(folder.rglob("*.json"))):
+        (moved / f"{i}.json").write_bytes(path.read_bytes())
+    again = tmp_path / "again.parquet"
+    assert main(["export", str(lacking), "--format", "seed", "--levels", str(moved), "-o", str(again)]) == 0
+    others = [name for name in SCHEMA.names if name != "file"]
+    assert pq.read_table(again).select(others).equals(pq.read_table(whole).select(others))
+    findings = examine(again)
+    assert (findings.wrong, findings.levels) == ({}, COUNT)
+    data = levelproof.open(again)
+    batch = data.read(range(len(data)), observation=None)
+    assert batch.goal.any(1).all()
+
+
+def test_commands_say_where_the_levels_come_from(lacking: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for command in ("inspect", "verify"):
+        assert main([command, str(lacking)]) == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert f"`levelproof export {lacking} --format seed --levels FOLDER -o whole.parquet`" in said
+    with pytest.raises(UserError, match="does not contain its levels"):
+        levelproof.open(lacking).read([0])
+
+
+def test_folder_that_lacks_a_level_is_refused(lacking: Path, folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "some").mkdir()
+    for path in sorted((folder / "some").iterdir())[1:]:
+        (tmp_path / "some" / path.name).write_bytes(path.read_bytes())
+    for there, count in (tmp_path / "some", 1), (tmp_path / "nothing", COUNT):
+        with pytest.raises(UserError, match=rf"no file of {count} levels? of the {COUNT}"):
+            add_levels(lacking, there, tmp_path / "again.parquet")
+    assert not (tmp_path / "again.parquet").exists()
+
+
+def test_other_levels_with_the_same_ids_are_refused(whole: Path, folder: Path, tmp_path: Path) -> None:
+    """The digest of all content hashes tells them apart."""
+    table = pq.read_table(whole)
+    table = table.set_column(table.column_names.index("content"), "content", pa.nulls(COUNT, pa.binary()))
+    other = tmp_path / "other.parquet"
+    other.write_bytes(seed_bytes([(table, ["c1:0"] * COUNT)], read_manifest(whole, []).config or {}, "128k"))
+    with pytest.raises(Failure, match="other levels than"):
+        add_levels(other, folder, tmp_path / "again.parquet")
+
+
+def test_options_that_make_no_sense_are_refused(
+    whole: Path, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sampled, out = whole.parent / "sampled.parquet", ["-o", str(tmp_path / "x.parquet")]
+    seed = ["--format", "seed"]
+    for source, words, told in (
+        (whole, ["--format", "minari", "--without-levels"], "are for --format seed"),
+        (whole, [*seed, "--without-levels", "--levels", str(folder)], "leave out --where and --without-levels"),
+        (sampled, [*seed, "--without-levels"], "leave out --without-levels"),
+        (sampled, [*seed, "--levels", str(folder)], "leave out --levels"),
+        (tmp_path, [*seed, "--levels", str(folder)], "is not one seed file"),
+        (whole, [*seed, "--levels", str(folder), "-o", str(whole)], "already exists"),
+    ):
+        assert main(["export", str(source), *out, *words]) == 2
+        assert told in capsys.readouterr().err
