@@ -171,6 +171,19 @@ def test_splits_of_several_sizes_make_one_policy(split: Path, tmp_path: Path) ->
     assert_refused(done, 2, "levels of one size")
 
 
+@pytest.mark.campaign
+def test_wandb_keeps_the_curves_of_a_run(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wandb = pytest.importorskip("wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    out = cloned(tmp_path, split, UPDATES, "log=wandb")
+    wandb.teardown()
+    (kept,) = (out / "log").glob("wandb/offline-run-*/run-*.wandb")
+    written = kept.read_bytes()
+    names = {name for numbers in metrics(out) for name in numbers}
+    assert {"bc/loss", "bc/validation_loss", "bc/core_seconds"} <= names
+    assert [name for name in names if name.encode() not in written] == []
+
+
 def test_levels_weigh_equally_and_end_at_their_first_goal(split: Path) -> None:
     """Levels are told apart by their polygons, which no two of them share."""
     config = replace(CloneConfig(), where="label = 'solved'", validation=0.3, train=ImitationConfig(100, batch=64))
