@@ -19,7 +19,7 @@ class CloneConfig:
     pool: int = 16_384  # levels in memory; every update draws from all of them evenly
     refresh: int = 1000  # updates until other levels replace those in memory, if the splits have more
     interval: int = 500  # updates between validations, each with a checkpoint
-    played: int = 256  # of each split, validation levels that the policy plays at each validation, once each
+    played: int = 256  # validation levels of each split that the policy plays, once each, at each validation
     seed: int = 0  # seed of the initial weights and of all random draws
     log: Literal["none", "tensorboard", "wandb"] = "none"  # logger of scalars, besides metrics.jsonl
     network: NetworkConfig = field(default_factory=NetworkConfig)  # network of the policy

@@ -158,7 +158,7 @@ class JobConfig:
     @property
     def origin(self) -> str:
         """What its levels' rows come from, as a progress report says it."""
-        return f"{self.budget} env steps each"
+        return f"budget {self.budget}"
 
     @property
     def env_steps(self) -> int:

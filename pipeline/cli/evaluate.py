@@ -21,8 +21,8 @@ ON = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    wrote = "folder of a policy that `levelproof clone` or `levelproof train` wrote"
-    policy = f"{wrote}, builtin:s, or a Python file that defines `act` (default: only the baselines play)"
+    wrote = "folder of a policy that `levelproof clone`, `train` or `distill` wrote"
+    policy = f"{wrote}, builtin:s or builtin:m, or a Python file that defines `act` (default: only the baselines play)"
     parser.add_argument("policy", type=Path, nargs="?", metavar="POLICY", help=policy)
     parser.add_argument("--on", default="sealed", metavar="LEVELS", help=ON)
     parser.add_argument("--where", metavar="SQL", help="use only levels of the split that meet this condition")

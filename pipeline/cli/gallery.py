@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--where", metavar="SQL", help="show only levels that meet this condition on columns")
     most = f"maximum number of levels to show, evenly spaced by id (default: {MAX_LEVELS})"
     parser.add_argument("--levels", type=int, default=MAX_LEVELS, metavar="COUNT", help=most)
-    policy = "folder of a policy, or builtin:s, whose first attempt at each level plays beside the witness"
+    policy = "folder of a policy, or builtin:s or builtin:m, whose first attempt at each level plays beside the witness"
     parser.add_argument("--policy", type=Path, metavar="POLICY", help=policy)
 
 

@@ -57,7 +57,7 @@ def cannot_start(error: Exception) -> LevelproofError | None:
 def noticing_slow_starts(seconds: float) -> Iterator[None]:
     """Tell the user if the `with` block, in which Ray starts or connects, lasts longer: Ray has no time limit."""
     where = f"the cluster at RAY_ADDRESS={ray_address()}" if ray_address() else "Ray on this machine"
-    words = f"Still waiting for {where} to answer: `ray status` says how it is; Ctrl-C stops."
+    words = f"Still waiting for {where} to answer: `ray status` shows its state; Ctrl-C stops waiting."
     notice = threading.Timer(seconds, print, (words,), {"file": sys.stderr, "flush": True})
     notice.daemon = True
     notice.start()

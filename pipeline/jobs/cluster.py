@@ -309,7 +309,7 @@ class Crew:
                 raise Failure(f"No worker can start ({handle.why}): try executor=inline, which may show the cause.")
             if handle not in usable:
                 self._given_up[handle.node] += 1
-                self._board.say(f"A worker cannot start ({handle.why}): it is given up; {len(usable)} are left.")
+                self._board.say(f"A worker cannot start ({handle.why}) and is given up; {len(usable)} remain.")
         self._handles = usable
 
     def _notice_silence(self, working: bool) -> None:
@@ -368,7 +368,7 @@ def _why_no_gpu() -> str:
     group = placement_group([{"GPU": 1}])
     try:
         if not group.wait(GPU_PATIENCE):
-            return f"after {duration(GPU_PATIENCE)} of waiting, others still hold all of them"
+            return f"all of them were still in use after {duration(GPU_PATIENCE)}"
         strategy = PlacementGroupSchedulingStrategy(group)
         probe = ray.remote(num_cpus=0, num_gpus=1, max_calls=1, scheduling_strategy=strategy)(jax_sees_a_gpu)
         return "" if ray.get(probe.remote(), timeout=PROBE_PATIENCE) else NO_GPU

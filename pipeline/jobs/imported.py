@@ -60,7 +60,7 @@ def import_folder(folder: Path, out: Path, console: Console) -> Exit:
     """
     require_folder(out, "import to it")
     if not can_be_noted(str(folder.absolute())):
-        raise UserError(f"Cannot import {folder}: its name has characters that no terminal shows, so rename it.")
+        raise UserError(f"Cannot import {folder}: its name has characters that terminals cannot show, so rename it.")
     try:
         source = open_folder(folder.expanduser().absolute())
     except FormatError as error:

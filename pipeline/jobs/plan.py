@@ -63,16 +63,16 @@ def report_lines(job: JobConfig, sample: Sample, cost: Forecast) -> list[str]:
     lines = {
         "wall time": f"{cost.wall.text(scale)} {unit} with {many(cost.workers, 'worker')}",
         f"{sample.device}-hours": cost.hours.text(),
-        "levels a work unit": f"{cost.unit:,}, {duration(cost.unit_seconds)} of a worker",
+        "levels per work unit": f"{cost.unit:,}, {duration(cost.unit_seconds)} on one worker",
         "solved levels": cost.solved.text(form="{:,.0f}".format),
-        f"{sample.device}-seconds a solved level": per_solved.text() if per_solved else "unknown",
+        f"{sample.device}-seconds per solved level": per_solved.text() if per_solved else "unknown",
         **{
             f"GB, density={name}": f"{cost.bytes[name].text(1e9)} in {many(cost.files[name], 'file')}, sealed"
             for name in cost.bytes
         },
     }
     return [
-        f"{many(cost.levels, 'level')} of size {job.size}, {job.budget} env steps each:",
+        f"{many(cost.levels, 'level')} of size {job.size}, budget {job.budget}:",
         *(f"  {name + ':':30} {text}" for name, text in lines.items()),
         f"Measured on {len(sample.busy)} of them, made on {sample.workers} {sample.device}s here in "
         f"{duration(sample.wall)}; {LIKELY:.0%} of outcomes fall within the intervals. This assumes workers as fast as "
@@ -171,7 +171,7 @@ def _stored(job: JobConfig, split: Path, table: pa.Table, folder: Path) -> dict[
 @contextmanager
 def _announced(console: Console, seconds: float) -> Iterator[None]:
     """Tell the user that the `with` block takes a while."""
-    text = f"making some of the levels here, which takes about {duration(seconds)} and the time to compile ..."
+    text = f"making some of the levels here: about {duration(seconds)}, plus compiling ..."
     if not console.is_terminal:
         say(console, text.capitalize())
         yield

@@ -149,7 +149,7 @@ def _not_regenerated(findings: Findings) -> list[str]:
         sentences.append(f"Not regenerated: {runs_text(runs(ids))}. Reason: {reason}.")
     ids = [i for i in findings.lost if from_files(findings.config or {}) and i not in findings.origins]
     if nameless := (findings.missing if from_files(findings.config or {}) else []) + runs(ids):
-        sentences.append(f"Not regenerated: {runs_text(nameless)}, whose level files no row names.")
+        sentences.append(f"Not regenerated: {runs_text(nameless)}, because no row names their level files.")
     return sentences
 
 

@@ -223,5 +223,5 @@ def averages(prefix: str, likenesses: Sequence[Any]) -> dict[str, float]:
 def line_of(update: int, last: int, numbers: dict[str, float]) -> str:
     loss, accuracy = (numbers[f"bc/validation_{name}"] for name in ("loss", "accuracy"))
     solved = f" · {numbers[SOLVED]:.1%} solved" if SOLVED in numbers else ""
-    validation = f"validation {loss:.3f}, {accuracy:.1%} right"
+    validation = f"validation loss {loss:.3f}, accuracy {accuracy:.1%}"
     return f"{update:,}/{last:,} updates · loss {numbers['bc/loss']:.3f} · {validation}{solved}"

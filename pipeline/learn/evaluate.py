@@ -91,9 +91,9 @@ def evaluate(
     if policy and on == SEALED:
         log, name = (policy.with_suffix(f".{LOOKS}"), AGENT) if agent else (policy / LOOKS, SAMPLED)
         if looks := log_look(log, name, facts, attempts, seed):
-            say(console, f"Look {looks} at the sealed levels; {log} lists all of this policy.")
+            say(console, f"Look {looks} at the sealed levels; {log} lists every look with this policy.")
         elif not str(policy).startswith(BUILTIN):  # those that come with levelproof were chosen before this look
-            say(console, f"Cannot write {log}, so nothing there says that you have looked at the sealed levels.")
+            say(console, f"Cannot write {log}, so this look at the sealed levels is not recorded.")
     if as_json:
         json.dump({"policy": policy and str(policy), "attempts": attempts, "seed": seed, "levels": facts}, sys.stdout)
         print()
@@ -102,7 +102,7 @@ def evaluate(
         _print(group, attempts, Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else WIDE))
     print("In brackets: 95% intervals over levels.")
     if any(group["published"] for group in facts):
-        print("sfl-paper, sfl-1m-envs: the reference's agents, as it published.")
+        print("sfl-paper, sfl-1m-envs: the reference's agents, with the rates that it published.")
 
 
 def is_named(on: str) -> bool:

@@ -91,7 +91,7 @@ def handmade_folder(say: Callable[[str], None] = print) -> Path:
         _fetch(Path(temporary))
         unpacked = Path(temporary) / "kinetix" / "levels"
         if not _is_whole(unpacked):
-            raise Failure(f"The package {PACKAGE} does not have the handmade levels that it should have.")
+            raise Failure(f"The package {PACKAGE} lacks some of the handmade levels: use another package index.")
         shutil.rmtree(folder, ignore_errors=True)
         unpacked.rename(folder)
     return folder

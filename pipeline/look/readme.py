@@ -131,8 +131,8 @@ def _header(name: str, splits: Sequence[SplitFacts], options: CardOptions) -> di
 OVERVIEW = """## What it is
 
 Tasks are those of [Kinetix](https://github.com/FLAIROx/Kinetix): in a 2D world of rigid bodies, make the **green** \
-and the **blue** body touch, but never the green and the **red** one, by switching motors and thrusters. Every level \
-is a task of its own.
+body touch the **blue** one, but never the **red** one, by switching motors and thrusters. Every level is a task of \
+its own.
 
 - **Solved means replayed.** A level is `solved` only if replaying its actions from its initial state, through the \
 engine, reached the goal. `levelproof verify` repeats the replay on your machine.

@@ -148,7 +148,7 @@ def test_repair_reads_lost_levels_from_their_files(folder: Path) -> None:
     fragment_paths(split)[0].write_bytes(b"PAR1")
     done = here(["verify", str(split), "--repair", "executor=inline"], folder)
     assert done.returncode == 1, done.stdout + done.stderr
-    assert "whose level files no row names" in done.stdout
+    assert "because no row names their level files" in done.stdout
 
 
 def test_level_without_shard_and_file_is_reported_as_lost(tmp_path: Path) -> None:

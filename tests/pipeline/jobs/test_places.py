@@ -49,7 +49,7 @@ assert not crew._gpus and crew._job.device == "cpu", messages
 crew.follow_cluster()
 assert len(crew._handles) == 1, crew._handles
 gpu, memory = messages
-assert gpu == "Workers use CPU cores, not GPUs: after 1 s of waiting, others still hold all of them.", gpu
+assert gpu == "Workers use CPU cores, not GPUs: all of them were still in use after 1 s.", gpu
 assert memory.endswith("has 2.0 GB of memory free, and a worker of this size needs 1.5 GB: it runs 1 of 2 workers.")
 crew.start_workers()
 reserved = ray.get(crew._handles[0].answer, timeout=600.0)
