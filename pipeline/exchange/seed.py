@@ -33,6 +33,7 @@ from levelproof.pipeline.store.seed.columns import KEPT, ROW_GROUP, SCHEMA
 from levelproof.pipeline.store.seed.file import SUFFIX
 from levelproof.pipeline.store.seed.packed import pack_witness
 from levelproof.pipeline.store.seed.rows import reason_of
+from levelproof.pipeline.store.seed.source import LevelSource
 from levelproof.pipeline.store.seed.worlds import pack_worlds
 from levelproof.pipeline.store.seed.write import seed_bytes
 from levelproof.pipeline.words import many
@@ -53,7 +54,8 @@ def export_seed(split: Path, where: str | None, out: Path, with_levels: bool = T
 
     Raises:
         UserError: the split does not exist, the condition is invalid, no level meets it, `out` exists or is not
-            named as seed files are, or levels that come from ids should be left out.
+            named as seed files are, its settings are such that this program could not read the file, or levels that
+            come from ids should be left out.
         Failure: the split is damaged, or a write fails.
     """
     check_new_seed(out)
@@ -65,8 +67,9 @@ def export_seed(split: Path, where: str | None, out: Path, with_levels: bool = T
         if not from_files(manifest.config or {}):
             raise UserError(f"The levels of {as_typed(split)} are sampled from their ids: leave out --without-levels.")
         rows = rows.set_column(rows.schema.get_field_index("file"), "file", [_below_one_folder(rows.column("file"))])
-    prepare_jax()
     config = {**(manifest.config or {}), **REPEATED}
+    LevelSource.require_readable(config, split)
+    prepare_jax()
     with writing_to(out):
         firsts = with_bar(range(0, rows.num_rows, ROW_GROUP), "row groups")
         groups = (_group(manifest, rows.slice(first, ROW_GROUP), with_levels) for first in firsts)

@@ -21,6 +21,7 @@ from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.types import Size
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.store.formats import FIRST_VERSION
+from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.seed.worlds import unpack_worlds
 
 
@@ -41,24 +42,46 @@ class LevelSource:
             Failure: this program makes other levels from their ids, or does not accept the settings.
         """
         try:
+            return LevelSource._made(config, path)
+        except ConfigError as error:
+            raise Failure(f"The seed file {path} {error}: use the levelproof that wrote it.") from None
+
+    @staticmethod
+    def require_readable(config: Mapping[str, Any], split: Path) -> None:
+        """Refuse the settings of a split whose seed file this program could not read.
+
+        Raises:
+            UserError: it makes other levels from their ids, or does not accept the settings in seed files.
+        """
+        try:
+            LevelSource._made(config, split)
+        except ConfigError as error:
+            raise UserError(
+                f"Cannot write a seed file of {as_typed(split)}, because it {error}: export it to another format, "
+                "or with the levelproof that made it."
+            ) from None
+
+    @staticmethod
+    def _made(config: Mapping[str, Any], path: Path) -> "LevelSource":
+        """Return the source. Raise ConfigError, with what the configuration has, if this program has no such source."""
+        try:
             rules = typed(TaskParams, config["task"], "task")
             size = size_of(config["size"])
             check_size(size)
             distribution = None if from_files(config) else typed(Distribution, config["distribution"], "distribution")
             if rules.frame_skip > MAX_FRAME_SKIP:
-                raise ConfigError(f"task.frame_skip is {rules.frame_skip}")
+                raise ConfigError(
+                    f"task.frame_skip is {rules.frame_skip}, and seed files have at most {MAX_FRAME_SKIP}"
+                )
             if not isinstance(config.get("engine_version", FIRST_VERSION), int):
                 raise ConfigError("engine_version is not a number")
         except (ValueError, KeyError, TypeError) as error:
-            raise Failure(
-                f"The seed file {path} has settings that this levelproof does not accept ({error}): "
-                "use the levelproof that wrote it."
-            ) from None
+            raise ConfigError(f"has settings that this levelproof does not accept ({error})") from None
         sampler = config.get("sampler_version")
         if distribution is not None and sampler != SAMPLER_VERSION:
-            raise Failure(
-                f"The levels of {path} were sampled by version {sampler!r:.9} of the sampler, and this "
-                f"program makes those of version {SAMPLER_VERSION}: use the levelproof that wrote it."
+            raise ConfigError(
+                f"has levels that version {sampler!r:.9} of the sampler made, and this program makes those of version "
+                f"{SAMPLER_VERSION}"
             )
         return LevelSource(path, size, distribution, rules)
 

@@ -14,6 +14,7 @@ from rich.console import Console
 
 import levelproof
 from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.labels import Label
 from levelproof.experts.witness.episode import repeat_episodes
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.pipeline.errors import Exit, UserError
@@ -25,7 +26,7 @@ from levelproof.pipeline.store.seed.columns import SCHEMA, WRITTEN
 from levelproof.pipeline.store.seed.packed import MAX_RUN, pack_witness, unpack_witnesses
 from levelproof.pipeline.store.seed.worlds import pack_worlds, unpack_worlds
 from levelproof.pipeline.verify.verify import examine
-from tests.pipeline.made import assert_same, honest_split, made_level
+from tests.pipeline.made import assert_same, honest_split, made_level, made_split
 
 ALL = np.ones(len(CHOICES), bool)
 QUIET = Console(quiet=True)
@@ -221,3 +222,15 @@ def test_grow_refuses_another_name_and_foreign_settings(seed: Path, tmp_path: Pa
         grow(seed, tmp_path / "128k/s", ["size=m"], QUIET)
     with pytest.raises(UserError, match="There is no seed file at"):
         grow(tmp_path / "none.parquet", tmp_path / "128k/s", INLINE, QUIET)
+
+
+def test_export_refuses_settings_that_no_seed_file_can_have(
+    split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    skipping, out = made_split(tmp_path / "skipping", [[Label.SOLVED]], "task.frame_skip=100"), tmp_path / "no.parquet"
+    with pytest.raises(UserError, match=r"task.frame_skip is 100, and seed files have at most 64\): export it to"):
+        export_seed(skipping, None, out)
+    monkeypatch.setattr("levelproof.pipeline.store.seed.source.SAMPLER_VERSION", 99)
+    with pytest.raises(UserError, match="of the sampler made, and this program makes those of version 99: export it"):
+        export_seed(split, None, out)
+    assert not out.exists()
