@@ -1,25 +1,44 @@
 """Seed files without their levels: they are added again from a folder of level files."""
 
 from collections.abc import Iterator, Mapping
+from itertools import count
 from pathlib import Path
+from typing import NamedTuple
 
+import jax
+import numpy as np
 import pyarrow as pa
 
 from levelproof.configs.schema import from_files
+from levelproof.experts.witness.episode import play_episodes
 from levelproof.levelgen.files.level_file import LevelFileError, read_level_file
 from levelproof.levelgen.identity.content import content_hashes, level_id_for
 from levelproof.levelgen.level import Level, name_of
+from levelproof.levelgen.sampling.sampler import CHUNK
+from levelproof.physics.step import ENGINE_VERSION
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.exchange.seed import check_new_seed
 from levelproof.pipeline.read.levels import writing_to
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store import files
+from levelproof.pipeline.store.formats import FIRST_VERSION
+from levelproof.pipeline.store.origins import can_be_noted
 from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.seed.columns import ROW_GROUP, SCHEMA
-from levelproof.pipeline.store.seed.file import SeedFile, read_seed, seed_files
+from levelproof.pipeline.store.seed.file import SeedFile, damaged_seed, read_seed, seed_files
+from levelproof.pipeline.store.seed.packed import unpack_witnesses
+from levelproof.pipeline.store.seed.source import LevelSource
 from levelproof.pipeline.store.seed.worlds import pack_worlds
 from levelproof.pipeline.store.seed.write import content_digest, seed_bytes
 from levelproof.pipeline.words import many
+
+
+class FoundLevel(NamedTuple):
+    """A level of a level file."""
+
+    content_hash: str
+    file: str  # absolute path
+    level: Level
 
 
 def add_levels(seed: Path, folder: Path, out: Path) -> None:
@@ -33,7 +52,8 @@ def add_levels(seed: Path, folder: Path, out: Path) -> None:
     Raises:
         UserError: `seed` is not one seed file, its levels come from their ids, or the folder lacks one of
             them, or `out` exists or is not named as seed files are.
-        Failure: the seed file is damaged, or its levels are not those that it was written from.
+        Failure: the seed file is damaged, the levels are not those that it was written from, or a witness does not
+            solve its level.
     """
     check_new_seed(out)
     paths = seed_files(seed)
@@ -60,32 +80,72 @@ def add_levels(seed: Path, folder: Path, out: Path) -> None:
     print(f'Next:  levelproof.open("{out}")')
 
 
-def _levels_below(folder: Path, size: str) -> dict[int, tuple[str, Level]]:
-    """Return the content hash and the level of every level file of a size, by the level's id."""
-    found = {}
-    for path in sorted(folder.rglob("*.json")):
+def _levels_below(folder: Path, size: str) -> dict[int, list[FoundLevel]]:
+    """Return the levels of all level files of a size by the level's id, each with all its files, in path order."""
+    found: dict[int, list[FoundLevel]] = {}
+    for path in sorted(folder.expanduser().absolute().rglob("*.json")):
         try:
             level = read_level_file(path).level
         except LevelFileError:  # of another program, perhaps: what counts is whether a level is lacking in the end
             continue
-        if name_of(level.size) == size:
+        if name_of(level.size) == size and can_be_noted(str(path)):
             content_hash = content_hashes(level)[0]
-            found[level_id_for(content_hash)] = content_hash, level
+            found.setdefault(level_id_for(content_hash), []).append(FoundLevel(content_hash, str(path), level))
     return found
 
 
 def _groups(
-    about: SeedFile, table: pa.Table, found: Mapping[int, tuple[str, Level]]
+    about: SeedFile, table: pa.Table, found: Mapping[int, list[FoundLevel]]
 ) -> Iterator[tuple[pa.Table, list[str]]]:
     """Yield row groups with content, and the content hashes of their levels."""
     for number, first in enumerate(range(0, table.num_rows, ROW_GROUP)):
         rows = table.slice(first, ROW_GROUP)
-        levels = [found[level_id] for level_id in rows.column("level_id").to_pylist()]
-        hashes = [content_hash for content_hash, _ in levels]
+        levels = [one for at in range(0, rows.num_rows, CHUNK) for one in _played(about, rows.slice(at, CHUNK), found)]
+        hashes = [one.content_hash for one in levels]
         if content_digest(hashes) != about.content[number]:
             raise Failure(
                 f"The level files have other levels than {about.fragment.path} was written from, though with the same "
                 "ids: use the files that were labelled."
             )
-        content = pa.array([pack_worlds(level)[0] for _, level in levels], pa.binary())
-        yield rows.set_column(rows.schema.get_field_index("content"), "content", content).select(SCHEMA.names), hashes
+        columns = {name: rows.column(name) for name in SCHEMA.names}
+        columns["content"] = pa.array([pack_worlds(one.level)[0] for one in levels], pa.binary())
+        columns["file"] = pa.array([one.file for one in levels], pa.string())
+        yield pa.table(columns, schema=SCHEMA), hashes
+
+
+def _played(about: SeedFile, rows: pa.Table, found: Mapping[int, list[FoundLevel]]) -> list[FoundLevel]:
+    """Choose a file for each row: of several with its level, which may number its bodies otherwise, one that its
+    witness solves.
+
+    Raises:
+        Failure: there is none, or the seed file is damaged.
+    """
+    files = [found[level_id] for level_id in rows.column("level_id").to_pylist()]
+    chosen = [each[0] for each in files]
+    same_engine = about.fragment.config.get("engine_version", FIRST_VERSION) == ENGINE_VERSION
+    left = np.flatnonzero(rows.column("witness").is_valid().to_numpy()) if same_engine else np.zeros(0, int)
+    for attempt in count():
+        for i in left:
+            if attempt == len(files[i]):
+                raise Failure(
+                    f"The witness of level {rows['level_id'][i]} does not solve {chosen[i].file}, though that file has "
+                    "the same level, perhaps with its bodies in another order: use the files that were labelled."
+                )
+            chosen[i] = files[i][attempt]
+        if not len(left):
+            return chosen
+        left = left[~_solves(about, rows.take(left), [chosen[i].level for i in left])]
+    raise AssertionError("unreachable")
+
+
+def _solves(about: SeedFile, rows: pa.Table, levels: list[Level]) -> np.ndarray:
+    """Whether the witness of each row has, in a level, the bits of its checksum, and solves it."""
+    steps = rows.column("steps_to_goal").to_numpy()
+    try:
+        action = unpack_witnesses(rows.column("witness").to_pylist(), steps)
+    except ValueError as error:
+        raise damaged_seed(about.fragment.path, error) from error
+    level = jax.tree.map(lambda *lanes: np.concatenate(lanes, -1), *levels)
+    rules = LevelSource.of(about.fragment.config, about.fragment.path).rules
+    played = play_episodes(level, action, steps, rules, frozenset())
+    return played.reaches & (played.checksum == rows.column("checksum").to_numpy())

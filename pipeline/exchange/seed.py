@@ -28,6 +28,7 @@ from levelproof.pipeline.store.contents import table_for
 from levelproof.pipeline.store.density import LAST_DISTANCE, MOVES, STATE, task_states
 from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
+from levelproof.pipeline.store.origins import RECORD
 from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.seed.columns import KEPT, ROW_GROUP, SCHEMA
 from levelproof.pipeline.store.seed.file import SUFFIX
@@ -55,7 +56,7 @@ def export_seed(split: Path, where: str | None, out: Path, with_levels: bool = T
     Raises:
         UserError: the split does not exist, the condition is invalid, no level meets it, `out` exists or is not
             named as seed files are, its settings are such that this program could not read the file, or levels that
-            come from ids should be left out.
+            come from ids or records should be left out.
         Failure: the split is damaged, or a write fails.
     """
     check_new_seed(out)
@@ -66,7 +67,7 @@ def export_seed(split: Path, where: str | None, out: Path, with_levels: bool = T
     if not with_levels:
         if not from_files(manifest.config or {}):
             raise UserError(f"The levels of {as_typed(split)} are sampled from their ids: leave out --without-levels.")
-        rows = rows.set_column(rows.schema.get_field_index("file"), "file", [_below_one_folder(rows.column("file"))])
+        rows = _without_folder(rows, split)
     config = {**(manifest.config or {}), **REPEATED}
     LevelSource.require_readable(config, split)
     prepare_jax()
@@ -89,11 +90,22 @@ def check_new_seed(out: Path) -> None:
         raise UserError(f"{out} already exists: name a new file with -o, or remove that one.")
 
 
-def _below_one_folder(file: pa.ChunkedArray) -> pa.Array:
-    """Return the paths of level files below the folder that all of them are in."""
-    paths = file.to_pylist()
-    folder = os.path.commonpath([os.path.dirname(path) for path in paths])
-    return pa.array([os.path.relpath(path, folder) for path in paths], pa.string())
+def _without_folder(rows: pa.Table, split: Path) -> pa.Table:
+    """Return rows that name their level files below the folder that all of them are in.
+
+    Raises:
+        UserError: levels are imported records, which `levels_elsewhere.add_levels` does not find.
+    """
+    files = [file or "" for file in rows.column("file").to_pylist()]
+    if records := [file for file in files if RECORD.fullmatch(file)]:
+        raise UserError(
+            f"Levels of {as_typed(split)} are imported records ({records[0]} is one), which no command could add "
+            "again: leave out --without-levels."
+        )
+    folders = [os.path.dirname(file) for file in files if os.path.isabs(file)]
+    folder = os.path.commonpath(folders) if folders else ""
+    below = [os.path.relpath(file, folder) if os.path.isabs(file) else file for file in files]
+    return rows.set_column(rows.schema.get_field_index("file"), "file", [pa.array(below, pa.string())])
 
 
 def _group(manifest: Manifest, rows: pa.Table, with_levels: bool) -> tuple[pa.Table, list[str]]:

@@ -6,25 +6,29 @@ from typing import Any
 import jax
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
+from rich.console import Console
 
 import levelproof
 from levelproof.configs.schema import FROM_FILES
-from levelproof.levelgen.files.level_file import LevelFile, write_level_file
+from levelproof.levelgen.files.level_file import LevelFile, read_level_file, write_level_file
 from levelproof.levelgen.identity.content import content_hashes, level_id_for
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.cli.main import main
-from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.errors import Exit, Failure, UserError
 from levelproof.pipeline.exchange.levels_elsewhere import add_levels
 from levelproof.pipeline.exchange.seed import export_seed
+from levelproof.pipeline.jobs.grow import grow
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.seed.columns import SCHEMA
 from levelproof.pipeline.store.seed.worlds import pack_worlds
 from levelproof.pipeline.store.seed.write import seed_bytes
 from levelproof.pipeline.verify.verify import examine
+from tests.levelgen.variants import renumbered
 from tests.pipeline.made import honest_split
 
 COUNT = 16
@@ -99,6 +103,49 @@ def test_levels_are_added_again_from_files_of_any_name(
     data = levelproof.open(again)
     batch = data.read(range(len(data)), observation=None)
     assert batch.goal.any(1).all()
+    files = [Path(file) for file in pq.read_table(again)["file"].to_pylist()]
+    assert {file.parent for file in files} == {moved}
+    grown = tmp_path / "grown/128k/s"
+    assert grow(again, grown, ["executor=inline"], Console(quiet=True)) == Exit.DONE
+    assert not examine(grown).wrong, "levels without a witness are read from their files"
+
+
+def test_file_that_the_witness_solves_is_taken_of_those_with_the_same_level(
+    whole: Path, lacking: Path, folder: Path, tmp_path: Path
+) -> None:
+    """Content hashes do not depend on the order of bodies, and what a witness does may."""
+    files, again, rng = tmp_path / "files", tmp_path / "again.parquet", np.random.default_rng(0)
+    files.mkdir()
+    for path in (folder / "some").iterdir():
+        other = renumbered(jax.tree.map(np.array, read_level_file(path).level), rng)
+        write_level_file(LevelFile(other, DEFAULT_RULES), files / f"0-{path.name}")
+    with pytest.raises(Failure, match=r"The witness of level \d+ does not solve .*0-level-\d+.json, though"):
+        add_levels(lacking, files, again)
+    for path in (folder / "some").iterdir():
+        (files / f"1-{path.name}").write_bytes(path.read_bytes())
+    add_levels(lacking, files, again)
+    assert (examine(again).wrong, examine(whole).wrong) == ({}, {})
+    witnessed = pq.read_table(again).filter(pc.is_valid(pq.read_table(again)["witness"]))
+    assert sum("/1-" in file for file in witnessed["file"].to_pylist()) > 1
+
+
+def with_files(whole: Path, path: Path, files: list[str]) -> Path:
+    """Write a copy of a seed file whose rows name these level files."""
+    table = pq.read_table(whole)
+    table = table.set_column(table.column_names.index("file"), "file", pa.array(files))
+    hashes = read_manifest(whole, ["content_hash"]).table["content_hash"].to_pylist()
+    path.write_bytes(seed_bytes([(table, hashes)], read_manifest(whole, []).config or {}, "128k"))
+    return path
+
+
+def test_export_without_levels_takes_relative_paths_and_refuses_records(whole: Path, tmp_path: Path) -> None:
+    absolute, relative = ([f"{start}/{i}.json" for i in range(COUNT // 2)] for start in ("/some/levels", "below"))
+    mixed, out = with_files(whole, tmp_path / "mixed.parquet", absolute + relative), tmp_path / "out.parquet"
+    export_seed(mixed, None, out, with_levels=False)
+    assert pq.read_table(out)["file"].to_pylist() == [f"{i}.json" for i in range(COUNT // 2)] + relative
+    records = with_files(whole, tmp_path / "records.parquet", [f"/theirs/first#{i}" for i in range(COUNT)])
+    with pytest.raises(UserError, match=r"are imported records \(/theirs/first#0 is one\).*leave out --without-levels"):
+        export_seed(records, None, tmp_path / "none.parquet", with_levels=False)
 
 
 def test_commands_say_where_the_levels_come_from(lacking: Path, capsys: pytest.CaptureFixture[str]) -> None:
