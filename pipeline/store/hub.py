@@ -58,14 +58,14 @@ def sign_in() -> dict[str, Any]:
 
 
 def files_below(repository: Repository, folder: str) -> dict[str, tuple[str, int]]:
-    """Return the hash and the size in bytes of every file below a folder; empty if the folder does not exist.
+    """Return the hash and the size in bytes of every file below a folder (empty: all); none if it does not exist.
 
     Raises:
         UserError: the repository does not exist, or may not be read.
         StoreFailure: the hub does not answer.
     """
-    revision = quote(repository.revision, safe="")
-    url = f"{_endpoint()}/api/datasets/{repository.name}/tree/{revision}/{quote(folder)}?recursive=true"
+    place = quote(repository.revision, safe="") + (f"/{quote(folder)}" if folder else "")
+    url = f"{_endpoint()}/api/datasets/{repository.name}/tree/{place}?recursive=true"
     listed: dict[str, tuple[str, int]] = {}
     while url:
         files, url = _page(url)

@@ -119,10 +119,11 @@ def stored_in(folder: Path) -> dict[Path, Stored]:
     else:
         listed = ask(folder, lambda: obstore_module().list(store, prefix=key).collect())
         files = {entry["path"]: Stored(_tag(entry), entry["size"]) for entry in listed}
+    prefix = f"{key}/" if key else ""
     return {
-        folder / name[len(key) + 1 :]: about
+        folder / name[len(prefix) :]: about
         for name, about in files.items()
-        if name.startswith(f"{key}/") and ".." not in name.split("/")
+        if name.startswith(prefix) and ".." not in name.split("/")
     }
 
 

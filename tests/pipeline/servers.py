@@ -259,7 +259,7 @@ def tag_of(file: Path) -> str:
 
 def hub_of(folder: Path, dataset: str, token: str, page: int) -> Answers:
     """Serve the hub's two endpoints for a dataset's files: lists in pages, and redirects to the files."""
-    resolved, listed = f"/datasets/{dataset}/resolve/main/", f"/api/datasets/{dataset}/tree/main/"
+    resolved, listed = f"/datasets/{dataset}/resolve/main/", f"/api/datasets/{dataset}/tree/main"
     files = files_of(folder)
 
     def answers(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
@@ -272,7 +272,8 @@ def hub_of(folder: Path, dataset: str, token: str, page: int) -> Answers:
         if not path.startswith(listed):
             return Answer(404, {}, b"{}")
         asked = urlsplit(path)
-        below = [file for file in sorted((folder / asked.path.removeprefix(listed)).rglob("*")) if file.is_file()]
+        place = folder / asked.path.removeprefix(listed).lstrip("/")
+        below = [file for file in sorted(place.rglob("*")) if file.is_file()]
         first = int((re.findall(r"cursor=(\d+)", asked.query) or ["0"])[0])
         entries = [
             {

@@ -235,6 +235,20 @@ def test_card_of_a_split_in_a_store_is_that_of_its_folder(
     assert written[0] == written[1] == written[2]
 
 
+def test_seed_file_at_the_root_of_a_store_opens(seed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "store/bucket").mkdir(parents=True)
+    shutil.copy(seed, tmp_path / "store/bucket/levels.parquet")
+    fingerprint = levelproof.open(seed).fingerprint
+    with serving(bucket_of(tmp_path / "store")) as server:
+        for name, value in {**KEYS, "ENDPOINT_URL": server.url}.items():
+            monkeypatch.setenv(f"AWS_{name}", value)
+        assert levelproof.open("s3://bucket/levels.parquet").fingerprint == fingerprint
+    with serving(hub_of(tmp_path / "store/bucket", "user/name", "secret", page=2)) as server:
+        monkeypatch.setenv("HF_ENDPOINT", server.url)
+        monkeypatch.setenv("HF_TOKEN", "secret")
+        assert levelproof.open("hf://datasets/user/name/levels.parquet").fingerprint == fingerprint
+
+
 @pytest.mark.campaign
 @pytest.mark.slow
 def test_ray_workers_grow_what_one_process_grows(seed: Path, tmp_path: Path) -> None:
