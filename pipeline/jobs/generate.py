@@ -178,7 +178,7 @@ def _work(
                 raise Failure(outcome.fatal)
             if outcome.summary:
                 events.ended(outcome)
-                sealer.committed(unit, outcome.summary.levels)
+                sealer.committed(outcome.summary.fragment or unit.name, outcome.summary.levels)
                 continue
             last = scheduler.failed(unit)
             events.ended(outcome, last)

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from levelproof.pipeline.jobs.unit import failure
 from levelproof.pipeline.read.rows import parts_of
 from levelproof.pipeline.store.contents import table_for
 from levelproof.pipeline.store.formats import Encoding
-from levelproof.pipeline.store.layout import SHARDS, new_attempt
+from levelproof.pipeline.store.layout import SHARDS, new_attempt, unit_name
 from levelproof.pipeline.store.locks import committing
 from levelproof.pipeline.store.manifest import begin_fragment, read_manifest, with_places, write_fragment
 from levelproof.pipeline.store.publish import committed_levels
@@ -49,14 +50,14 @@ class Grower:
     def _grow(self, unit: WorkUnit) -> UnitOutcome:
         try:
             with lap() as took:
-                levels, solved, steps = grow_unit(self._job, self._split, unit)
+                made = grow_unit(self._job, self._split, unit)
         except Exception as error:
             return failure(self._split, unit, error)
-        return UnitOutcome(unit, Summary(levels, solved, EnvSteps(replayed=steps), Seconds(replay=took.seconds)))
+        return UnitOutcome(unit, replace(made, seconds=Seconds(replay=took.seconds)))
 
 
-def grow_unit(job: GrowConfig, split: Path, unit: WorkUnit) -> tuple[int, int, int]:
-    """Commit the rows and records of a unit; return its levels, how many are solved, and the env steps simulated.
+def grow_unit(job: GrowConfig, split: Path, unit: WorkUnit) -> Summary:
+    """Commit the rows and records of a unit.
 
     Leaves out levels whose states differ here from the seed file's checksum, or whose witness misses the goal.
 
@@ -66,7 +67,7 @@ def grow_unit(job: GrowConfig, split: Path, unit: WorkUnit) -> tuple[int, int, i
     """
     source, left = Path(job.level_files), unit.only(set(unit.level_ids) - committed_levels(split, unit.name))
     if left is None:
-        return 0, 0, 0
+        return Summary(0, 0, EnvSteps())
     table = read_manifest(source, level_ids=list(left.level_ids)).table
     played = np.flatnonzero(table.column("shard").is_valid())
     good, arrays = np.zeros(0, int), {}
@@ -76,18 +77,22 @@ def grow_unit(job: GrowConfig, split: Path, unit: WorkUnit) -> tuple[int, int, i
         good = np.flatnonzero(simulated.unlike < 0)
         arrays = {name: np.moveaxis(x[good], 0, -1) for name, x in simulated.arrays.items()}
     kept = np.setdiff1d(np.arange(table.num_rows), np.delete(played, good))
+    rows, name = table.take(kept), ""
     if len(kept):
-        _commit(job, split, left, table.take(kept), arrays)
-    rows = table.take(kept)
+        ids = rows.column("level_id").to_pylist()
+        name = unit_name(ids[0], ids[-1])  # not of the unit: a later command may grow its first and last level
+        if not {*ids} <= committed_levels(split, name):
+            _commit(job, split, name, rows, arrays)
     steps = pc.call_function("sum", [table.column("steps_to_goal")]).as_py() or 0
-    return rows.num_rows, rows.column("label").to_pylist().count(Label.SOLVED), steps
+    solved = rows.column("label").to_pylist().count(Label.SOLVED)
+    return Summary(rows.num_rows, solved, EnvSteps(replayed=steps), fragment=name)
 
 
-def _commit(job: GrowConfig, split: Path, unit: WorkUnit, rows: pa.Table, arrays: dict[str, np.ndarray]) -> None:
+def _commit(job: GrowConfig, split: Path, unit: str, rows: pa.Table, arrays: dict[str, np.ndarray]) -> None:
     """Write the shard, if any level has a record, then the fragment."""
     witnessed = rows.column("shard").is_valid().to_numpy()
     with committing(split) as folder:
-        paths = new_attempt(folder, unit.name)
+        paths = new_attempt(folder, unit)
         begin_fragment(paths)
         name = f"{SHARDS}/{paths.shard.name}"
         if witnessed.any():

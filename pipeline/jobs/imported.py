@@ -85,7 +85,7 @@ def import_folder(folder: Path, out: Path, console: Console) -> Exit:
                     reported = sum(skipped.values())
                     wrong = _import(job, split, source, part, shlex.join(command), console, reported)
                     skipped.update(wrong)
-                    sealer.committed(part.unit, len(part.unit.level_ids) - len(wrong))
+                    sealer.committed(part.unit.name, len(part.unit.level_ids) - len(wrong))
                     sealer.advance(first)
         except KeyboardInterrupt:
             say(console, "Stopped: committed units stay; run the same command to continue.")

@@ -93,6 +93,7 @@ class Summary:
     solved: int
     spent: EnvSteps
     seconds: Seconds = NO_SECONDS
+    fragment: str = ""  # name of its fragment; empty: that of the unit
 
 
 @dataclass(frozen=True)

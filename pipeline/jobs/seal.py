@@ -14,7 +14,6 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from levelproof.configs.schema import KEY_EVERY, KEYS_EVERY, Density, stored_as
 from levelproof.pipeline.errors import LevelproofError, UserError
 from levelproof.pipeline.jobs.progress import say
-from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store import seal as store
@@ -110,10 +109,10 @@ class Sealer:
         self._running: tuple[list[Piece], Future[Piece]] | None = None
         self._broken = False
 
-    def committed(self, unit: WorkUnit, levels: int) -> None:
-        """Add the new fragment of a unit with so many levels; a unit without any has written none."""
+    def committed(self, unit: str, levels: int) -> None:
+        """Add the new fragment of the unit of this name, with so many levels; a unit without any has written none."""
         if levels:
-            path = fragment_path(self._split, unit.name)
+            path = fragment_path(self._split, unit)
             self._pieces[path] = Piece(path, levels, False)
 
     def advance(self, first: int | None) -> None:

@@ -39,7 +39,7 @@ def make(source: Path, split: Path) -> Make:
 
     def committed(sealer: Sealer, unit: WorkUnit, coming: Collection[WorkUnit]) -> None:
         commit_copy(source, unit.level_ids[0], split)
-        sealer.committed(unit, len(unit.level_ids))
+        sealer.committed(unit.name, len(unit.level_ids))
         sealer.advance(min((later.level_ids[0] for later in coming), default=None))
 
     return committed

@@ -19,7 +19,9 @@ from levelproof.experts.witness.episode import repeat_episodes
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.pipeline.errors import Exit, UserError
 from levelproof.pipeline.exchange.seed import export_seed
-from levelproof.pipeline.jobs.grow import grow
+from levelproof.pipeline.jobs.grow import _job, grow
+from levelproof.pipeline.jobs.grower import grow_unit
+from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.store.fields import arrays_of
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.seed.columns import SCHEMA, WRITTEN
@@ -213,6 +215,19 @@ def test_grow_leaves_out_levels_whose_bits_differ(
     for read in (levelproof.open(path).__getitem__, levelproof.open(path).episodes):
         with pytest.warns(levelproof.EngineDiffers):
             read(0)
+
+
+def test_unit_whose_ends_were_left_out_is_committed_beside_what_it_had(split: Path, tmp_path: Path) -> None:
+    seed, out = tmp_path / "right.parquet", tmp_path / "128k/s"
+    export_seed(split, "label = 'solved'", seed)
+    ids, sums = (pq.read_table(seed)[name].to_pylist() for name in ("level_id", "checksum"))
+    wrong = rewritten(seed, tmp_path / "wrong.parquet", checksum=[sums[0] ^ 1, *sums[1:-1], sums[-1] ^ 1])
+    for path, units, kept in (wrong, [ids, ids], ids[1:-1]), (seed, [[ids[0], ids[-1]]], ids):
+        out.mkdir(parents=True, exist_ok=True)
+        for unit in units:
+            grow_unit(_job(path, out, INLINE, read_manifest(path, []).config or {}), out, WorkUnit(tuple(unit)))
+        assert read_manifest(out).level_ids.tolist() == kept
+    assert len(fragment_paths(out)) == 2
 
 
 def test_grow_refuses_another_name_and_foreign_settings(seed: Path, tmp_path: Path) -> None:
