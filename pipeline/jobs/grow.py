@@ -8,7 +8,7 @@ import numpy as np
 from rich.console import Console
 
 from levelproof.configs.compose import compose_job
-from levelproof.configs.schema import GrowConfig
+from levelproof.configs.schema import GrowConfig, from_files
 from levelproof.pipeline.errors import Exit, Failure, UserError
 from levelproof.pipeline.jobs.generate import generate
 from levelproof.pipeline.jobs.progress import say
@@ -18,7 +18,7 @@ from levelproof.pipeline.store.manifest import read_manifest, require_manifest
 from levelproof.pipeline.store.remote import absolute, as_typed, is_remote
 from levelproof.pipeline.store.seed.columns import ROW_GROUP
 from levelproof.pipeline.store.seed.file import is_seed, read_seed, seed_files
-from levelproof.pipeline.store.seed.source import LevelSource
+from levelproof.pipeline.store.seed.source import LevelSource, without_levels
 from levelproof.pipeline.store.seed.write import content_digest
 from levelproof.pipeline.words import many
 
@@ -35,8 +35,8 @@ def grow(source: Path, out: Path, settings: Sequence[str], console: Console) -> 
         console: receives progress and messages.
 
     Raises:
-        UserError: `source` has no seed file, `out` does not end in their budget and size, a setting is not one of
-            SETTINGS, or as `generate`.
+        UserError: `source` has no seed file or one without its levels, `out` does not end in their budget and size, a
+            setting is not one of SETTINGS, or as `generate`.
         Failure: a seed file is damaged or has levels that this program does not make, or as `generate`.
     """
     if wrong := [setting for setting in settings if setting.partition("=")[0] not in SETTINGS]:
@@ -51,9 +51,22 @@ def grow(source: Path, out: Path, settings: Sequence[str], console: Console) -> 
         )
     manifest = require_manifest(source, [])
     job = _job(source, out, settings, manifest.config or {})
+    _require_levels(source, manifest.config or {})
     command = ["levelproof", "grow", as_typed(source), "-o", str(out), *settings]
     code = generate(job, command, console, level_ids=manifest.level_ids.tolist())
     return max(code, _report(source, out, manifest.level_ids, console))
+
+
+def _require_levels(source: Path, config: dict) -> None:
+    """Refuse seed files that were written without their levels, before anything else is.
+
+    Raises:
+        UserError: a file lacks levels.
+        Failure: a file is damaged.
+    """
+    for path in seed_files(source) if from_files(config) else ():
+        if read_seed(path, ["content"])[1].column("content").null_count:
+            raise without_levels(path)
 
 
 def _job(source: Path, out: Path, settings: Sequence[str], config: dict) -> GrowConfig:

@@ -28,7 +28,7 @@ from levelproof.levelgen.level import Level, size_of
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.step import ENGINE_VERSION
-from levelproof.pipeline.errors import Failure, StoreFailure
+from levelproof.pipeline.errors import Failure, StoreFailure, UserError
 from levelproof.pipeline.jobs.schedule import Summary, UnitOutcome, WorkUnit
 from levelproof.pipeline.read.level_files import LevelUnavailable, levels_at
 from levelproof.pipeline.store.checkpoints import SourceUnseen, experts_for, save_experts
@@ -37,7 +37,7 @@ from levelproof.pipeline.store.fields import arrays_of, unlike_fields
 from levelproof.pipeline.store.formats import Encoding
 from levelproof.pipeline.store.layout import Attempt, new_attempt
 from levelproof.pipeline.store.leases import LeaseLost
-from levelproof.pipeline.store.locks import LockRefused, committing
+from levelproof.pipeline.store.locks import committing
 from levelproof.pipeline.store.manifest import begin_fragment, write_fragment
 from levelproof.pipeline.store.origins import RECORD, Origin
 from levelproof.pipeline.store.paused import CheckpointUnread, drop_paused, load_paused
@@ -87,7 +87,7 @@ def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, run: TrainingRun) -
 def failure(split: Path, unit: WorkUnit, error: Exception) -> UnitOutcome:
     """Return a failed attempt as a value, because exceptions may not survive the way to another process."""
     reason, fatal = "".join(traceback.format_exception(error)), ""
-    if isinstance(error, (LockRefused, SourceUnseen, LevelUnavailable, LeaseLost, StoreFailure, CheckpointUnread)):
+    if isinstance(error, (UserError, SourceUnseen, LevelUnavailable, LeaseLost, StoreFailure, CheckpointUnread)):
         fatal = str(error)
     elif isinstance(error, OSError) and (sentence := refusal(error, written_disk(split))):
         fatal = f"{sentence}."

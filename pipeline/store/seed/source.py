@@ -98,10 +98,7 @@ class LevelSource:
         """
         if self.distribution is None:
             if any(one is None for one in content):
-                raise UserError(
-                    f"The seed file {self.path} does not contain its levels: add them from their level files with "
-                    f"`levelproof export {self.path} --format seed --levels FOLDER -o whole.parquet`."
-                )
+                raise without_levels(self.path)
             return unpack_worlds([one for one in content if one is not None], self.size)
         ids = np.asarray(level_ids, np.int32)
         lanes = block_size(len(ids), CHUNK)
@@ -109,3 +106,11 @@ class LevelSource:
             jax.device_get(sample_chunk(ids[some], self.size, self.distribution)) for some in blocks(len(ids), lanes)
         ]
         return take(concatenate_levels(parts), slice(len(ids)))
+
+
+def without_levels(path: Path) -> UserError:
+    """Return the error for a seed file that was written without its levels."""
+    return UserError(
+        f"The seed file {as_typed(path)} does not contain its levels: add them from their level files with "
+        f"`levelproof export {as_typed(path)} --format seed --levels FOLDER -o whole.parquet`."
+    )

@@ -148,7 +148,9 @@ def test_export_without_levels_takes_relative_paths_and_refuses_records(whole: P
         export_seed(records, None, tmp_path / "none.parquet", with_levels=False)
 
 
-def test_commands_say_where_the_levels_come_from(lacking: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_say_where_the_levels_come_from(
+    lacking: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for command in ("inspect", "verify"):
         assert main([command, str(lacking)]) == 2
         said = capsys.readouterr().err
@@ -156,6 +158,9 @@ def test_commands_say_where_the_levels_come_from(lacking: Path, capsys: pytest.C
         assert f"`levelproof export {lacking} --format seed --levels FOLDER -o whole.parquet`" in said
     with pytest.raises(UserError, match="does not contain its levels"):
         levelproof.open(lacking).read([0])
+    assert main(["grow", str(lacking), "-o", str(tmp_path / "grown/128k/s")]) == 2
+    assert "does not contain its levels" in capsys.readouterr().err
+    assert not (tmp_path / "grown").exists()
 
 
 def test_folder_that_lacks_a_level_is_refused(lacking: Path, folder: Path, tmp_path: Path) -> None:
