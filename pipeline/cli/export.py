@@ -35,14 +35,14 @@ def _parquet(split: Path, where: str | None, out: Path) -> None:
     export_parquet(split, where, out)
 
 
-def _seed(split: Path, where: str | None, out: Path, levels: Path | None = None, with_levels: bool = True) -> None:
+def _seed(split: Path, where: str | None, out: Path, levels: str | None = None, with_levels: bool = True) -> None:
     if levels:
         if where or not with_levels:
             raise UserError("--levels adds the levels to a whole seed file: leave out --where and --without-levels.")
         from levelproof.pipeline.exchange.levels_elsewhere import add_levels
         from levelproof.pipeline.learn.published import HANDMADE, handmade_folder
 
-        add_levels(split, handmade_folder() if str(levels) == HANDMADE and not levels.exists() else levels, out)
+        add_levels(split, handmade_folder() if levels == HANDMADE else Path(levels), out)
         return
     from levelproof.pipeline.exchange.seed import export_seed
 
@@ -73,8 +73,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--without-levels", action="store_true", help="leave levels that come from files out of a seed file"
     )
     parser.add_argument(
-        "--levels", type=Path, metavar="FOLDER",
-        help="level files of the levels that a seed file lacks; handmade: those of the reference",
+        "--levels", metavar="FOLDER",
+        help="level files of the levels that a seed file lacks; `handmade`: those of the reference, "
+        "whatever folder has that name",
     )  # fmt: skip
     parser.add_argument("-o", "--out", type=Path, help=f"file or folder to write (default for {JSON}: level.json)")
 

@@ -20,6 +20,7 @@ from levelproof.levelgen.sampling.sampler import CHUNK
 from levelproof.pipeline.store.bounds import DAMAGE
 from levelproof.pipeline.store.columns import COLUMNS, REPETITIVE, schema_of
 from levelproof.pipeline.store.fragment import Fragment
+from levelproof.pipeline.store.remote import absolute, as_typed
 from levelproof.pipeline.store.seed.columns import KEPT
 from levelproof.pipeline.store.seed.file import SeedFile, damaged_seed, read_seed, seed_files
 from levelproof.pipeline.store.seed.source import LevelSource
@@ -168,7 +169,8 @@ def _commands(about: SeedFile, rows: pa.Table) -> pa.Array:
 
     config, path = about.fragment.config, about.fragment.path
     if from_files(config):
-        start = shlex.join(["levelproof", "regenerate", f"manifest={path.absolute()}", f"budget={about.budget}"])
+        source = as_typed(absolute(path))
+        start = shlex.join(["levelproof", "regenerate", f"manifest={source}", f"budget={about.budget}"])
         start, end = f"{start} where='level_id = ", "'"
     else:
         start = shlex.join(["levelproof", "generate", f"budget={about.budget}", *changed_settings(config)])

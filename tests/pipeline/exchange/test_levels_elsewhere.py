@@ -23,6 +23,7 @@ from levelproof.pipeline.errors import Exit, Failure, UserError
 from levelproof.pipeline.exchange.levels_elsewhere import add_levels
 from levelproof.pipeline.exchange.seed import export_seed
 from levelproof.pipeline.jobs.grow import grow
+from levelproof.pipeline.learn import published
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.seed.columns import SCHEMA
 from levelproof.pipeline.store.seed.worlds import pack_worlds
@@ -30,6 +31,7 @@ from levelproof.pipeline.store.seed.write import seed_bytes
 from levelproof.pipeline.verify.verify import examine
 from tests.levelgen.variants import renumbered
 from tests.pipeline.made import honest_split
+from tests.pipeline.servers import files_of, forget, serving
 
 COUNT = 16
 
@@ -161,6 +163,27 @@ def test_commands_say_where_the_levels_come_from(
     assert main(["grow", str(lacking), "-o", str(tmp_path / "grown/128k/s")]) == 2
     assert "does not contain its levels" in capsys.readouterr().err
     assert not (tmp_path / "grown").exists()
+
+
+def test_handmade_means_those_of_the_reference_and_a_path_means_a_folder(
+    lacking: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also where an earlier command has made a folder of that name."""
+    monkeypatch.setattr(published, "handmade_folder", lambda: folder)
+    monkeypatch.chdir(tmp_path)
+    Path("handmade").mkdir()
+    words = ["export", str(lacking), "--format", "seed", "-o", "whole.parquet", "--levels"]
+    assert main([*words, "./handmade"]) == 2
+    assert "handmade has no file of 16 levels" in capsys.readouterr().err
+    assert main([*words, "handmade"]) == 0
+
+
+def test_command_of_a_row_behind_a_url_names_the_url(whole: Path) -> None:
+    forget()
+    with serving(files_of(whole.parent)) as server:
+        url = f"{server.url}/{whole.name}"
+        commands = read_manifest(Path(url), ["command"]).table["command"].to_pylist()
+    assert f"manifest={url} " in commands[0]
 
 
 def test_folder_that_lacks_a_level_is_refused(lacking: Path, folder: Path, tmp_path: Path) -> None:
