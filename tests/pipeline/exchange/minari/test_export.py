@@ -19,7 +19,7 @@ from levelproof.pipeline.cli.main import main
 from levelproof.pipeline.exchange.minari.episodes import ActionKind, encode_actions, episodes_of
 from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.manifest import read_manifest
-from tests.pipeline.made import made_job
+from tests.pipeline.made import honest_split, made_job
 
 pytestmark = pytest.mark.slow
 MANY = 16  # levels with ids below this are compared
@@ -131,3 +131,11 @@ def test_export_minari_rejects_invalid_arguments(
     assert "--actions is for --format minari" in actions
     assert missing.endswith('run `pip install "minari[hdf5]"`.')
     assert not (tmp_path / "out").exists()
+
+
+def test_budget_with_a_decimal_point_gives_a_name_that_minari_opens(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    split = honest_split(tmp_path / "data", 8, 1, "budget=11.5M")
+    assert split.parent.name == "11.5M"
+    assert export_and_load(split, tmp_path / "out", monkeypatch).id == "levelproof/11_5M/s-v0"
