@@ -104,7 +104,7 @@ class JobConfig:
         last = self.first_level + parse_count(self.levels, "levels") - 1
         if self.first_level < 0 or last > MAX_LEVEL_ID:
             raise ConfigError(f"level ids {self.first_level} to {last} do not fit: they run from 0 to {MAX_LEVEL_ID}.")
-        check_budget(self.env_steps, self.expert, self.stop)
+        self._check_budget()
         if self.unit is not None and self.unit < 1:
             raise ConfigError(f"unit is {self.unit}: a work unit needs at least 1 level.")
         if self.workers < 0:
@@ -127,6 +127,9 @@ class JobConfig:
                 f"size is {self.size}: it has no room for the actuators that {', '.join(CONTROL_WEIGHTS)} in "
                 "distribution require (a motor needs a joint and a third body beside the scenery)."
             )
+
+    def _check_budget(self) -> None:
+        check_budget(self.env_steps, self.expert, self.stop)
 
     @property
     def levels_per_unit(self) -> int:
@@ -189,6 +192,9 @@ def stored_as(density: Density, key_every: int = KEY_EVERY) -> str:
 class ImportConfig(JobConfig):
     """The settings of a job of `levelproof import`: `level_files` is a folder of records, whose actions label them."""
 
+    def _check_budget(self) -> None:
+        _ = self.env_steps  # no expert uses it here
+
     @property
     def results(self) -> dict[str, Any]:
         known = super().results
@@ -200,6 +206,9 @@ class GrowConfig(JobConfig):
     """The settings of a job of `levelproof grow`: `level_files` is a seed file, or a folder of some."""
 
     grown: str = "{}"  # the `results` of the seed files, as JSON
+
+    def _check_budget(self) -> None:
+        _ = self.env_steps  # no expert uses it here
 
     @property
     def origin(self) -> str:
@@ -218,6 +227,11 @@ class GrowConfig(JobConfig):
 def from_files(results: Mapping[str, Any]) -> bool:
     """Whether a job with these `JobConfig.results` has levels that are not sampled: level files, or imported ones."""
     return results.get("distribution") in (FROM_FILES, FROM_RECORDS)
+
+
+def is_grown(results: Mapping[str, Any]) -> bool:
+    """Whether these are the settings of a seed file, or of a split grown from one."""
+    return REPEATED.items() <= results.items()
 
 
 def decisive(settings: Mapping[str, Any], renamed: Mapping[str, str] = RENAMED) -> dict[str, Any]:

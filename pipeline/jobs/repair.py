@@ -13,7 +13,7 @@ from rich.console import Console
 from levelproof.configs.compose import changed_settings, compose_job
 from levelproof.configs.errors import ConfigError
 from levelproof.configs.numbers import parse_count
-from levelproof.configs.schema import FROM_RECORDS, JobConfig, from_files, hash_of
+from levelproof.configs.schema import FROM_RECORDS, JobConfig, from_files, hash_of, is_grown
 from levelproof.pipeline.errors import Exit, Failure, UserError
 from levelproof.pipeline.jobs.generate import generate
 from levelproof.pipeline.jobs.progress import say
@@ -23,6 +23,7 @@ from levelproof.pipeline.store.layout import EXPERTS, data_paths
 from levelproof.pipeline.store.locks import without_commits
 from levelproof.pipeline.store.mend import take_out
 from levelproof.pipeline.store.runs import merged, runs, runs_text
+from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.store.split import locked, taken
 from levelproof.pipeline.verify.findings import Findings
 
@@ -43,7 +44,8 @@ def repair(split: Path, settings: Sequence[str], console: Console) -> Exit:
         console: receives progress and messages.
 
     Raises:
-        UserError: there is no split, it was imported, another command writes to it, or a setting is not in SETTINGS.
+        UserError: there is no split, it was imported or grown, another command writes to it, or a setting is not in
+            SETTINGS.
         ConfigError: a setting has a wrong value.
         Failure: it was made with settings that this program does not accept, or a write failed.
     """
@@ -97,7 +99,14 @@ def _examine(split: Path) -> Findings:
 
 
 def _require_generated(split: Path, findings: Findings) -> None:
-    """Raise UserError for an imported split, because this program cannot regenerate lost actions."""
+    """Raise UserError for a split that no job generated: its actions are elsewhere, and cannot be regenerated."""
+    if is_seed(split):
+        raise UserError(f"Seed files such as {split} are not repaired: copy it again from its source.")
+    if is_grown(findings.config or {}):
+        raise UserError(
+            f"The split {split} was grown from seed files, so it is not repaired: delete it and run `levelproof grow` "
+            "again."
+        )
     if (findings.config or {}).get("distribution") == FROM_RECORDS:
         raise UserError(
             f"The split {split} was imported, so its levels cannot be regenerated: delete it, and import its folder of "

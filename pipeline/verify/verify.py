@@ -21,7 +21,7 @@ from rich.console import Console
 
 from levelproof.configs.convert import typed
 from levelproof.configs.errors import ConfigError
-from levelproof.configs.schema import from_files
+from levelproof.configs.schema import FROM_RECORDS, from_files, is_grown
 from levelproof.levelgen.identity.keys import ALIKE_VERSIONS, SAMPLER_VERSION
 from levelproof.levelgen.level import size_of
 from levelproof.levelgen.sampling.sampler import CHUNK, Distribution
@@ -84,9 +84,15 @@ def verify(split: Path, as_json: bool, console: Console) -> Exit:
         print(json.dumps(findings.as_json(), indent=2))
     else:
         print(findings.report(split))
-        if findings.wrong and not is_remote(split) and not is_seed(split):
+        if findings.wrong and not is_remote(split) and _is_repaired(split, findings):
             print(f"Next:  levelproof verify {shlex.quote(str(split))} --repair")
     return Exit.FAILED if findings.wrong else Exit.DONE
+
+
+def _is_repaired(split: Path, findings: Findings) -> bool:
+    """Whether `verify --repair` may remake what is wrong; actions that came from elsewhere it cannot."""
+    config = findings.config or {}
+    return not is_seed(split) and not is_grown(config) and config.get("distribution") != FROM_RECORDS
 
 
 def examine(split: Path, console: Console | None = None) -> Findings:

@@ -22,7 +22,7 @@ from levelproof.configs.compose import (
 from levelproof.configs.convert import flat, nested, plain
 from levelproof.configs.errors import ConfigError, warn_of_name
 from levelproof.configs.meanings import every_setting
-from levelproof.configs.schema import ADDED, RENAMED, WITHOUT_EFFECT, decisive, hash_of
+from levelproof.configs.schema import ADDED, RENAMED, WITHOUT_EFFECT, GrowConfig, ImportConfig, decisive, hash_of
 from levelproof.experts.config import ExpertConfig
 from levelproof.levelgen.sampling.distribution import Distribution
 from levelproof.levelgen.task.rules import TaskParams
@@ -264,3 +264,10 @@ def test_compose_job_rejects_a_distribution_whose_actuators_do_not_fit_the_size(
     with pytest.raises(ConfigError, match="size is 5-5-2-0: it has no room for the actuators"):
         compose_job(["size=5-5-2-0", "distribution=thrusters"])
     assert compose_job(["size=5-5-2-0", "distribution=vehicles"]).size == "5-5-2-0"
+
+
+def test_jobs_that_train_nothing_take_any_budget() -> None:
+    for kind in GrowConfig, ImportConfig:
+        assert kind(budget="1k", level_files="elsewhere").env_steps == 1000
+        with pytest.raises(ConfigError, match="budget is '0'"):
+            kind(budget="0", level_files="elsewhere")

@@ -119,6 +119,17 @@ def test_verify_and_grow_report_levels_that_a_sampler_makes_otherwise(seed: Path
     assert_refused(done, 1, "In 1 row group, this sampler makes other levels", "use the levelproof that wrote it")
 
 
+def test_seed_files_and_what_is_grown_from_them_are_not_repaired(seed: Path, tmp_path: Path) -> None:
+    assert here(["grow", str(seed), "-o", "128k/s", INLINE], tmp_path).returncode == 0
+    chunk = next(path for path in (tmp_path / "128k/s/shards").rglob("*") if path.is_file() and "c" in path.parts)
+    chunk.write_bytes(bytes(len(chunk.read_bytes())))
+    drifted = forged(seed, tmp_path / "drifted.parquet", without_digest)
+    for source, told in ("128k/s", "delete it and run `levelproof grow` again"), (str(drifted), "copy it again from"):
+        done = here(["verify", source], tmp_path)
+        assert (done.returncode, "Next:" in done.stdout) == (1, False), done.stderr
+        assert_refused(here(["verify", source, "--repair", INLINE], tmp_path), 2, told)
+
+
 def test_gallery_show_and_export_of_a_seed_file_are_those_of_its_split(split: Path, seed: Path, tmp_path: Path) -> None:
     level_id = str(read_manifest(seed, []).level_ids[solved(seed)])
 
