@@ -9,7 +9,7 @@ from jaxtyping import Int
 
 from levelproof.configs.convert import typed
 from levelproof.configs.schema import JobConfig
-from levelproof.experts.config import ExpertConfig
+from levelproof.experts.config import ExpertConfig, StopConfig
 from levelproof.experts.generalist.teachers import KnownExperts, no_experts
 from levelproof.pipeline.read.levels import recorded_settings
 from levelproof.pipeline.store.checkpoints import load_experts
@@ -39,8 +39,12 @@ def experts_of(split: Path, level_ids: Int[np.ndarray, " level"]) -> KnownExpert
     if not by_file:
         return no_experts(len(level_ids))
     with recorded_settings(split):
-        config = typed(ExpertConfig, (manifest.config or {})["expert"], "expert")
-        job = JobConfig(size=rows[0]["size"], expert=config)
+        known = manifest.config or {}
+        config, stop = typed(ExpertConfig, known["expert"], "expert"), typed(StopConfig, known["stop"], "stop")
+        # Its levels are there already, so `level_files`: no distribution has to be able to make this size
+        job = JobConfig(
+            size=rows[0]["size"], budget=str(known["budget"]), level_files=str(split), expert=config, stop=stop
+        )
     params = {}
     for name, ids in by_file.items():
         experts = load_experts(data_path(split, name), job, WITHOUT)

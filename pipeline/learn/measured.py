@@ -22,6 +22,7 @@ from levelproof.pipeline.learn.sealed import SEALED, known_sealed
 from levelproof.pipeline.read.level_files import levels_at, levels_below
 from levelproof.pipeline.read.levels import COLUMNS, levels_of, rules_of
 from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.store.job_note import sound_note
 from levelproof.pipeline.store.manifest import fragment_paths, require_manifest
 from levelproof.pipeline.store.remote import is_remote
 from levelproof.pipeline.store.seed.file import is_seed
@@ -78,7 +79,7 @@ def levels_in(
     Calls `say` with a sentence for each level file that is left out.
 
     Raises:
-        UserError: there is no split and no usable level file, or no level meets the condition.
+        UserError: there is no split with levels and no usable level file, or no level meets the condition.
         Failure: the split is damaged.
     """
     if is_split(place):
@@ -86,8 +87,10 @@ def levels_in(
         return
     if where is not None:
         raise UserError(f"--where selects levels of a split, but {place} is not a split: leave --where out.")
+    if sound_note(place):
+        require_manifest(place, [])  # raises: a job has begun here, and nothing is committed
     try:
-        listing = levels_below(place, JobConfig())
+        listing = levels_below(place, JobConfig(level_files=str(place)))
     except UserError:
         raise UserError(f"There are no levels at {place}: name a split, a level file or a folder of them.") from None
     if not listing.levels:

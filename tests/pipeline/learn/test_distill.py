@@ -158,6 +158,19 @@ def test_experts_that_a_split_kept_are_those_of_their_levels(
         experts_of(split, ids)
 
 
+def test_experts_of_another_budget_and_procedure_are_read(
+    split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job, ids = made_job("data", "size=s", "procedure=published", "budget=2k"), np.arange(1)
+    save_experts(tmp_path / "experts.npz", {0: KeptExpert(begun_like(job), [0.5])})
+    table = kept_experts.require_manifest(split, ["experts", "size"], ids).table.from_pylist(
+        [{"level_id": 0, "size": "s", "experts": f"{EXPERTS}/000000000000-000000000000-0123456789abcdef.npz"}]
+    )
+    monkeypatch.setattr(kept_experts, "require_manifest", lambda *_: _With(table, job.results))
+    monkeypatch.setattr(kept_experts, "data_path", lambda *_: tmp_path / "experts.npz")
+    assert experts_of(split, ids).config == job.expert
+
+
 class _With:
     """A manifest of this table."""
 

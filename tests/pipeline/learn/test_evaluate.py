@@ -14,19 +14,22 @@ from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, i
 from levelproof.experts.networks.saved import Policy, save_policy
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.files.kinetix import state_to_kinetix
+from levelproof.levelgen.files.level_file import LevelFile, write_level_file
 from levelproof.levelgen.level import SIZES, size_of
+from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.exchange.level_json import export
 from levelproof.pipeline.learn import published
 from levelproof.pipeline.learn.looks import LOOKS, log_look
-from levelproof.pipeline.learn.measured import midway_levels
+from levelproof.pipeline.learn.measured import levels_in, midway_levels
 from levelproof.pipeline.learn.sealed import SEALED, known_sealed
 from levelproof.pipeline.learn.solve_rates import interval, solve_rates
 from levelproof.pipeline.learn.specialists import sealed_specialists, specialists_of
+from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.command import ROOT, assert_refused, here, run
-from tests.pipeline.made import honest_split
+from tests.pipeline.made import honest_split, made_job
 from tests.quick import jit_once
 
 ONCE = ("--attempts", "1")  # another number compiles other programs
@@ -100,6 +103,26 @@ def test_command_names_level_files_that_it_leaves_out(split: Path, tmp_path: Pat
     assert "damaged.json" in done.stderr
     (group,) = json.loads(done.stdout)["levels"]
     assert group["of"]["all"]["random"]["levels"] == 1
+
+
+def test_level_files_of_a_size_that_no_distribution_makes_are_measured(tmp_path: Path) -> None:
+    size = size_of("6-0-1-0")
+    with pytest.raises(ValueError, match="no room for the actuators"):
+        made_job("data", "size=6-0-1-0")
+    (tmp_path / "mine").mkdir()
+    write_level_file(LevelFile(empty_level(size, 1), DEFAULT_RULES), tmp_path / "mine/level.json")
+    (group,) = levels_in(tmp_path / "mine", None, None, print)
+    assert group.levels.size == size
+
+
+def test_split_in_which_nothing_is_committed_is_named(tmp_path: Path) -> None:
+    job = made_job("data")
+    (tmp_path / "data/128k/s").mkdir(parents=True)
+    note_job(tmp_path / "data/128k/s", job, ["levelproof", "generate"], [(0, 3)])
+    done = here(["evaluate", "--on", "data/128k/s", *ONCE], tmp_path)
+    assert_refused(done, 2, "Nothing is committed in data/128k/s yet")
+    done = here(["train", "levels=data/128k/s", "-o", "policy"], tmp_path)
+    assert_refused(done, 2, "Nothing is committed in data/128k/s yet")
 
 
 @pytest.mark.parametrize(
