@@ -158,10 +158,10 @@ def test_experts_that_a_split_kept_are_those_of_their_levels(
         experts_of(split, ids)
 
 
-def test_experts_of_another_budget_and_procedure_are_read(
+def test_experts_whose_updates_need_a_larger_budget_are_read(
     split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    job, ids = made_job("data", "size=s", "procedure=published", "budget=2k"), np.arange(1)
+    job, ids = made_job("data", "size=s", "budget=1M", "expert.environments=8192"), np.arange(1)
     save_experts(tmp_path / "experts.npz", {0: KeptExpert(begun_like(job), [0.5])})
     table = kept_experts.require_manifest(split, ["experts", "size"], ids).table.from_pylist(
         [{"level_id": 0, "size": "s", "experts": f"{EXPERTS}/000000000000-000000000000-0123456789abcdef.npz"}]
