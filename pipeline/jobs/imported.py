@@ -3,6 +3,7 @@
 import shlex
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
+from levelproof.configs.compose import compose_job
 from levelproof.configs.schema import ImportConfig
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.labels import WITNESSED
@@ -30,10 +32,12 @@ from levelproof.pipeline.read.kinetix.zarr2 import FormatError, StoredArray
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store.job_note import note_job
+from levelproof.pipeline.store.layout import split_path
 from levelproof.pipeline.store.manifest import Manifest, read_manifest
 from levelproof.pipeline.store.origins import Origin, RecordPlace, can_be_noted
 from levelproof.pipeline.store.remote import require_folder
 from levelproof.pipeline.store.runs import runs
+from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.store.split import writing
 from levelproof.pipeline.words import many
 
@@ -65,7 +69,7 @@ def import_folder(folder: Path, out: Path, console: Console) -> Exit:
         source = open_folder(folder.expanduser().absolute())
     except FormatError as error:
         raise UserError(f"Cannot import {folder}: {error}.") from None
-    job = _job(source, out)
+    job = _as_stored(_job(source, out))
     command = ["levelproof", "import", str(source.path), "-o", str(out)]
     prepare_jax()
     with writing(job, partial(say, console)) as (split, manifest):
@@ -112,6 +116,17 @@ def _job(folder: Folder, out: Path) -> ImportConfig:
         raise UserError(
             f"Cannot make the split {out} ({reason}): {example}, with the budget of the imported experts."
         ) from None
+
+
+def _as_stored(job: ImportConfig) -> ImportConfig:
+    """Return the job with the density of its split, which `seal --density` may have changed since the import began."""
+    split = split_path(job.out, job.budget, job.size)
+    fragments = [] if is_seed(split) else read_manifest(split, []).fragments
+    stored = {density for fragment in fragments for density in fragment.densities}
+    if not stored or job.stored in stored:
+        return job
+    known = compose_job(min(stored).split())
+    return replace(job, density=known.density, key_every=known.key_every)
 
 
 def _parts(folder: Folder) -> Iterator[UnitOfRows]:

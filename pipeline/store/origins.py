@@ -67,7 +67,7 @@ def origins_of(split: Path, level_ids: Collection[int]) -> dict[int, Origin]:
     """Return the origins of levels of a split, by level id.
 
     Raises:
-        UserError: the file of a level without a shard is missing.
+        UserError: the file, or the imported folder, of a level without a shard is missing.
         Failure: a fragment is damaged.
     """
     rows = read_manifest(split, ASKED, list(level_ids)).table.to_pylist()
@@ -76,9 +76,12 @@ def origins_of(split: Path, level_ids: Collection[int]) -> dict[int, Origin]:
     missing = [file for file in files if not place_of(file) and not os.path.isfile(file)]
     if missing:
         more = f" and {len(missing) - 1} more" if missing[1:] else ""
+        lacking = f"No shard of {split} has the level of {missing[0]}{more}, and its"
+        if record := RECORD.fullmatch(missing[0]):
+            raise UserError(f"{lacking} folder is missing: put the imported folder {record[1]} back.")
         raise UserError(
-            f"No shard of {split} has the level of {missing[0]}{more}, and its file is missing: put it back, "
-            "or label the files where they are now with levelproof generate level_files=FOLDER."
+            f"{lacking} file is missing: put it back, or label the files where they are now with "
+            "levelproof generate level_files=FOLDER."
         )
     return origins
 

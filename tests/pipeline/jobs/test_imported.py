@@ -146,7 +146,11 @@ def test_regenerate_labels_imported_levels_at_another_budget(once: Path, tmp_pat
     assert rows_of(tmp_path / "again/data/5k/s")[0] | {name: row[name] for name in of_the_run} == row
 
 
-def test_import_continues_after_a_stop(once: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("density", ["full", "witness"])
+def test_import_continues_after_a_stop(
+    density: str, once: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also if the split was sealed to another density in between."""
     committed, commit = [], module.commit
 
     def once_only(job, split, unit, *rest) -> None:
@@ -162,11 +166,27 @@ def test_import_continues_after_a_stop(once: Path, tmp_path: Path, monkeypatch: 
     assert done.returncode == 130
     assert "run the same command to continue" in done.stderr
     assert read_status(tmp_path / "data/1M/s")["done"] < ROWS == read_status(tmp_path / "data/1M/s")["wanted"]
+    if density != "full":
+        sealing = ["seal", "data/1M/s", "--density", density, "--key-every", "64"]
+        assert here(sealing, tmp_path).returncode == 0
     done = here(words, tmp_path)
-    assert "1 of 2 units are already there" in done.stderr
+    assert "1 of 2 units are already there" in done.stderr, done.stderr
     want, got = (rows_of(path / "data/1M/s") for path in (once, tmp_path))
     same = [name for name in want[0] if name not in ("shard", "command", "learning_curve")]
     assert [[row[name] for name in same] for row in got] == [[row[name] for name in same] for row in want]
+
+
+def test_import_that_is_gone_is_named(folder: Path) -> None:
+    moved = folder / "moved"
+    shutil.copytree(folder, moved)
+    words = ["regenerate", "manifest=moved/data/1M/s", "budget=5k", "executor=inline", "where=label = 'unsolved'"]
+    gone = Path(rows_of(moved / "data/1M/s")[0]["file"]).parent
+    gone.rename(gone.with_name("away"))
+    try:
+        done = here(words, folder)
+    finally:
+        gone.with_name("away").rename(gone)
+    assert_refused(done, 2, f"its folder is missing: put the imported folder {gone} back.")
 
 
 def test_import_reports_and_skips_invalid_records(once: Path, tmp_path: Path) -> None:
