@@ -158,7 +158,7 @@ def _rows(
     for row_of_shard, i in enumerate(kept):
         rows[i] |= {"shard": str(paths.shard.relative_to(folder)), "row": row_of_shard}
     for row, origin in zip(rows, unit.origins, strict=bool(unit.origins)):
-        row |= {"file": origin.file, "command": command or _command(job, origin, row["level_id"])}
+        row |= {"file": origin.file, "command": command or origin.command or _command(job, origin, row["level_id"])}
     for row in rows if result.experts else ():
         if row["level_id"] in result.experts:
             row["experts"] = str(paths.experts.relative_to(folder))

@@ -57,7 +57,7 @@ from levelproof.pipeline.store.manifest import (
     require_manifest,
 )
 from levelproof.pipeline.store.named import open_shard
-from levelproof.pipeline.store.origins import origin_of
+from levelproof.pipeline.store.origins import RECORD, origin_of
 from levelproof.pipeline.store.remote import is_remote
 from levelproof.pipeline.store.runs import runs, runs_text, without
 from levelproof.pipeline.store.seed.file import is_seed
@@ -237,6 +237,7 @@ def _check_fragments(parts: Sequence[Part], recipe: Recipe, findings: Findings, 
         elif not findings.lost & level_ids:  # every level can still be copied from it
             findings.wrong[wrong] = level_ids
     _note_losses(rows, recipe, findings)
+    _keep_commands(parts, findings)
 
 
 def _levels_by_name(rows: pa.Table, column: str) -> dict[str, set[int]]:
@@ -283,6 +284,17 @@ def _note_losses(rows: pa.Table, recipe: Recipe, findings: Findings) -> None:
                 findings.unrepairable[level_id] = str(failure)[:-1]
         if level_id in findings.unrepairable:
             findings.changed -= {row["shard"], row["experts"]}
+
+
+def _keep_commands(parts: Sequence[Part], findings: Findings) -> None:
+    """Note the commands of lost levels of an import: this split, which the repair reads, is not their source."""
+    lost = [i for i, origin in findings.origins.items() if not origin.command and RECORD.fullmatch(origin.file)]
+    for fragment, rows in parts:
+        if np.isin(rows.column("level_id").to_numpy(), lost).any():
+            with suppress(OSError):  # sealed since, so it will be examined again
+                commands = read_fragment(fragment.path, ["level_id", "command"])[1].to_pylist()
+                known = {row["level_id"]: row["command"] for row in commands}
+                findings.origins |= {i: findings.origins[i]._replace(command=known[i]) for i in lost if i in known}
 
 
 def _find_lost_levels(

@@ -144,6 +144,10 @@ def test_regenerate_labels_imported_levels_at_another_budget(once: Path, tmp_pat
     assert done.returncode == 0, done.stderr
     of_the_run = ("shard", "row", "seconds")
     assert rows_of(tmp_path / "again/data/5k/s")[0] | {name: row[name] for name in of_the_run} == row
+    shutil.rmtree(next((tmp_path / "data/5k/s/shards").iterdir()))
+    done = here(["verify", str(tmp_path / "data/5k/s"), "--repair", "executor=inline"], tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert [row["command"] for row in rows_of(tmp_path / "data/5k/s")] == [row["command"] for row in after]
 
 
 @pytest.mark.parametrize("density", ["full", "witness"])
