@@ -41,7 +41,8 @@ def run(args: argparse.Namespace) -> Report:
         "one: the protocol of the reference (kinetix-env 3.0.2), whose README has the rates of `sfl-paper` and "
         "`sfl-1m-envs`. The reference wrote the levels; ours are played in our engine. Unsolvable levels count, too. "
         "Brackets: 95% intervals over levels; the published rates have none.",
-        "Env steps count reinforcement only.",
+        "Env steps are those that reinforcement learned from: not those in which learnability measured levels, nor "
+        "those of searches for demonstrations. The READMEs of `builtin:s` and `builtin:m` say how many these were.",
         *(
             f"`{policy}` also learned from demonstrations, whose env steps are not counted: witnesses of {count:,} "
             "levels."

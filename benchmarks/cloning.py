@@ -5,6 +5,7 @@ resumes from its checkpoint, and the folder keeps finished evaluations.
 """
 
 import argparse
+import hashlib
 import itertools
 import json
 import os
@@ -76,27 +77,27 @@ def run(args: argparse.Namespace) -> Report:
     rows = [row_of(kind, [each for each in results if (each["variant"], each["levels"]) == kind]) for kind in kinds]
     head = ("cloned from", "seeds", "core-seconds", *COLUMNS, "sampled, on levels cloned from")
     counts = {name: f"{rates['random']['levels']:,}" for name, rates in results[0]["sealed"].items()}
-    title = (
-        f"Share of sealed levels of {size} solved; brackets: the least and the most of several seeds, "
-        "of one seed the 95% interval over levels"
-    )
+    title = f"Share of sealed levels of {size} solved, with 95% intervals over levels; of several seeds, both are means"
     players = results[0]["sealed"]
     others = [
         [name, *(interval_text(players[levels][name][key]) for levels, key in ((ALL, "once"), (SOLVED, "once"),
                                                                               (SOLVED, "best")))]
         for name in BASELINES if name in players[ALL]
     ]  # fmt: skip
-    settings = "".join(f" `{setting}`" for setting in args.set)
+    settings, seeds = "".join(f" `{setting}`" for setting in args.set), by_seed(results, kinds)
     notes = [
         f"*Of all*: {counts[ALL]} levels, of which some cannot be solved; *of solved*: the {counts[SOLVED]} that are "
         "labelled solved. One attempt at each level, or the best of 8.",
         f"Each policy took {args.updates:,} updates{', with' * bool(settings)}{settings}. A tenth of the levels that "
         "it was cloned from were kept from training, for validation. *Mirrored*: with `mirror=true`. Core-seconds are "
         "those of the clone, with compiling, reading and validation, and without those of the data. The last column "
-        "plays at most 1,024 of the levels, that tenth included.",
+        "plays at most 1,024 of the levels, that tenth included. Every policy is the average of its last updates, not "
+        "the best of its validations: few levels are passed over hundreds of times, and an earlier end might suit them "
+        "better.",
         f"Points that ten times the levels add to *sampled, of solved*: {'; '.join(gains(results))}. "
         "Where new levels are solved nearly as often as those cloned from, more levels cannot help much: the updates, "
         "the network or the method set the limit.",
+        *[f"*Sampled, of solved*, seed by seed, in percent: {seeds}."] * bool(seeds),
         "Each policy was measured on sealed levels once, here.",
     ]
     second = Table(
@@ -124,10 +125,12 @@ def measured(args: argparse.Namespace, size: str, last: int, variant: str, count
             "core_seconds": lines_of(policy)[-1]["bc/core_seconds"]}  # fmt: skip
 
 
-def kept(file: Path, *words: Any) -> dict[str, Any]:
-    """Return an evaluation's rates, from its file if an earlier run made it."""
+def kept(file: Path, policy: Path | str, *words: Any) -> dict[str, Any]:
+    """Return an evaluation's rates, from its file if an earlier run made it with the same arguments."""
+    told = hashlib.sha256(" ".join(map(str, words)).encode()).hexdigest()[:8]
+    file = file.with_stem(f"{file.stem}-{told}")
     if not file.exists():
-        file.write_text(command("evaluate", *words, "--json"))
+        file.write_text(command("evaluate", policy, *words, "--json"))
     return json.loads(file.read_text())["levels"][0]["of"]
 
 
@@ -166,15 +169,28 @@ def row_of(kind: tuple[str, int], results: list[dict[str, Any]]) -> list[str]:
         ", ".join(filter(None, (f"{count:,}", variant))),
         str(len(results)),
         f"{seconds:,.0f}",
-        *map(range_text, rates),
+        *map(mean_text, rates),
     ]
 
 
-def range_text(rates: list[dict[str, Any]]) -> str:
-    if len(rates) == 1:
-        return interval_text(rates[0])
-    values = [each["rate"] for each in rates]
-    return f"{np.mean(values):.1%} ({min(values):.1%} to {max(values):.1%})"
+def by_seed(results: list[dict[str, Any]], kinds: list[tuple[str, int]]) -> str:
+    """Say how much training's own chance matters: the rates of each kind of clone, seed by seed."""
+    told = []
+    for kind in kinds:
+        rates = [once_of(each) for each in results if (each["variant"], each["levels"]) == kind]
+        if len(rates) > 1:
+            told.append(f"{kind[1]:,}: {', '.join(f'{rate:.1f}' for rate in rates)}")
+    return "; ".join(told)
+
+
+def once_of(result: dict[str, Any]) -> float:
+    """Return the main rate of a policy in percent: one sampled attempt at solved sealed levels."""
+    return 100 * result["sealed"][SOLVED][SAMPLED]["once"]["rate"]
+
+
+def mean_text(rates: list[dict[str, Any]]) -> str:
+    """Return the mean rate of several seeds, and the mean of their intervals over levels: it allows for no seeds."""
+    return interval_text({name: np.mean([each[name] for each in rates], axis=0) for name in ("rate", "interval")})
 
 
 def gains(results: list[dict[str, Any]]) -> list[str]:
@@ -182,7 +198,7 @@ def gains(results: list[dict[str, Any]]) -> list[str]:
     rates: dict[int, list[float]] = {}
     for each in results:
         if not each["variant"]:
-            rates.setdefault(each["levels"], []).append(100 * each["sealed"][SOLVED][SAMPLED]["once"]["rate"])
+            rates.setdefault(each["levels"], []).append(once_of(each))
     means = [(count, float(np.mean(some))) for count, some in sorted(rates.items())]
     return [
         f"from {few:,} to {many:,}, {(of_many - of_few) / np.log10(many / few):+.1f}"

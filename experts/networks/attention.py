@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from levelproof.experts.networks.layers import POLICY_GAIN, SUMMARY, maximum
+from levelproof.experts.networks.layers import POLICY_GAIN, SUMMARY, maximum, orthogonal
 from levelproof.experts.networks.relations import EntityTables
 from levelproof.levelgen.task.actions import MOTOR_CHOICES, THRUSTER_CHOICES
 
@@ -134,8 +134,9 @@ class ActuatorHead(nn.Module):
     ) -> Float[Array, "choice actuator lane"]:
         own = OnColumns(self.width, name="Dense_0")(tokens)
         shared = OnColumns(self.width, use_bias=False, name="Dense_1")(summary)
-        last = nn.initializers.orthogonal(POLICY_GAIN)
-        return OnColumns(self.choices, kernel_init=last, name="Dense_2")(nn.relu(own + shared[:, None]))
+        return OnColumns(self.choices, kernel_init=orthogonal(POLICY_GAIN), name="Dense_2")(
+            nn.relu(own + shared[:, None])
+        )
 
 
 def obeying(bound: Float[Array, "actuator entry lane"], logits: Float[Array, "choice actuator lane"]) -> Array:

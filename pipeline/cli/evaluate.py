@@ -11,6 +11,7 @@ EXAMPLE = """\
 levelproof evaluate policy/
 levelproof evaluate policy/ --on data/128k/s --where "label = 'solved'" --start 0 0.5
 levelproof evaluate policy/ --on handmade
+levelproof evaluate policy/ --against builtin:s --on data/128k/s
 levelproof evaluate my_agent.py --attempts 4
 levelproof evaluate policy/ --on sealed/64k/s --experts sealed/16k/s sealed/64k/s
 levelproof evaluate --on my-levels --json"""
@@ -36,6 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--start", type=float, nargs="+", default=[0.0], metavar="SHARE", help=start)
     experts = "splits with the same levels, whose experts are listed for comparison"
     parser.add_argument("--experts", type=Path, nargs="+", default=[], metavar="SPLIT", help=experts)
+    against = "another policy or Python file to compare with, level by level"
+    parser.add_argument("--against", type=Path, metavar="POLICY", help=against)
     add_json(parser)
 
 
@@ -44,6 +47,8 @@ def run(arguments: argparse.Namespace) -> None:
         value = getattr(arguments, name)
         if value is not None and not least <= value < 2**31:
             raise UserError(f"--{name} is {value}: it must be from {least} to {2**31 - 1}.")
+    if arguments.against and not arguments.policy:
+        raise UserError("--against compares two policies: name the first one before it.")
     if arguments.experts and any(arguments.start):
         raise UserError("--experts rates episodes from the levels' start: leave out --start.")
     for share in arguments.start:
@@ -72,4 +77,5 @@ def run(arguments: argparse.Namespace) -> None:
         [*dict.fromkeys(arguments.start)],
         arguments.experts,
         arguments.json,
+        arguments.against,
     )

@@ -22,7 +22,7 @@ NAMES = (
     "export grow import_ card status verify seal"
 )
 # Checks of arguments that are paths; those of other names must not be URLs of an unsupported kind
-CHECKS = {"out": require_here, "plot": require_here, "policy": require_policy}
+CHECKS = {"out": require_here, "plot": require_here, "policy": require_policy, "against": require_policy}
 COMMANDS = [import_module(f"levelproof.pipeline.cli.{name}") for name in NAMES.split()]
 
 

@@ -29,10 +29,11 @@ from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.learn.looks import LOOKS, log_look
 from levelproof.pipeline.learn.measured import MeasuredLevels, is_split, levels_in, midway_levels, sealed_levels
 from levelproof.pipeline.learn.published import PROTOCOLS, published_levels
-from levelproof.pipeline.learn.solve_rates import Solved, solve_rates
+from levelproof.pipeline.learn.sealed import SEALED as SEALED_IDS
+from levelproof.pipeline.learn.solve_rates import Solved, difference, solve_rates
 from levelproof.pipeline.learn.specialists import Specialists, sealed_specialists, specialists_of
 from levelproof.pipeline.read.agents import SUFFIX as AGENT_SUFFIX
-from levelproof.pipeline.read.agents import agent_in
+from levelproof.pipeline.read.agents import Agent, agent_in
 from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.words import many
@@ -40,7 +41,7 @@ from levelproof.pipeline.words import many
 SEALED = "sealed"
 ATTEMPTS = 8
 WIDE = 120  # columns of a table that no terminal shows: in 80, Rich would cut long rates
-NOTHING, SAMPLED, AGENT = "doing nothing", "policy, sampled", "agent"
+NOTHING, POLICY, OTHER, AGENT = "doing nothing", "policy", "other", "agent"
 ALL, NOT_TRIVIAL, SOLVED = "all", "that doing nothing does not solve", "labelled solved"  # denominators
 
 
@@ -55,6 +56,7 @@ def evaluate(
     starts: Sequence[float],
     experts: Sequence[Path],
     as_json: bool,
+    against: Path | None = None,
 ) -> None:
     """Play levels, and print a table of solve rates or JSON.
 
@@ -69,33 +71,39 @@ def evaluate(
         starts: where in the witnesses of a split attempts start, as shares of the steps to the goal, 0 to below 1.
         experts: splits whose own experts of the levels stand in the table, too.
         as_json: whether to print JSON instead of tables.
+        against: another policy or agent, with which `policy` is compared level by level; None: none.
 
     Raises:
         UserError: the policy or the levels do not exist, or do not fit each other; or the agent fails.
         Failure: the split is damaged.
     """
     prepare_jax()
-    agent = agent_in(policy) if policy and policy.suffix == AGENT_SUFFIX else None
-    loaded = policy_at(policy) if policy and not agent else None
-    entrants = _entrants(loaded) | ({AGENT: _Entrant(agent)} if agent else {})
+    contestants = [_contestant(path, title) for path, title in ((policy, POLICY), (against, OTHER)) if path]
+    entrants = BASELINES | {name: entrant for each in contestants for name, entrant in each.entrants.items()}
     console = Console(stderr=True)
-    facts = []
+    facts, looked_at = [], []
     if attempts is None:
         attempts = PROTOCOLS[on].attempts if on in PROTOCOLS else ATTEMPTS
     for group in _groups(on, where, sizes, count, starts, partial(say, console)):
-        if loaded:
-            require_size(loaded, group.levels.size, group.name, "choose others with --on or --size")
-        facts.append(_measured(group, entrants, _own_experts(group, on, experts, attempts), attempts, seed, console))
-        if agent and agent.error:
-            raise UserError(f"{agent.error}.")
-    if policy and on == SEALED:
-        log, name = (policy.with_suffix(f".{LOOKS}"), AGENT) if agent else (policy / LOOKS, SAMPLED)
-        if looks := log_look(log, name, facts, attempts, seed):
-            say(console, f"Look {looks} at the sealed levels; {log} lists every look with this policy.")
-        elif not str(policy).startswith(BUILTIN):  # those that come with levelproof were chosen before this look
-            say(console, f"Cannot write {log}, so this look at the sealed levels is not recorded.")
+        for each in contestants:
+            if each.policy:
+                require_size(each.policy, group.levels.size, group.name, "choose others with --on or --size")
+        own = _own_experts(group, on, experts, attempts)
+        facts.append(_measured(group, entrants, own, [each.main for each in contestants], attempts, seed, console))
+        for each in contestants:
+            if each.agent and each.agent.error:
+                raise UserError(f"{each.agent.error}.")
+        if np.isin(group.level_ids, SEALED_IDS).any():  # in a split of them, too
+            looked_at.append(facts[-1])
+    for each in contestants if looked_at else ():
+        if looks := log_look(each.looks, each.main, looked_at, attempts, seed):
+            say(console, f"Look {looks} at the sealed levels; {each.looks} lists every look with this policy.")
+        elif not str(each.path).startswith(BUILTIN):  # those that come with levelproof were chosen before this look
+            say(console, f"Cannot write {each.looks}, so this look at the sealed levels is not recorded.")
     if as_json:
-        json.dump({"policy": policy and str(policy), "attempts": attempts, "seed": seed, "levels": facts}, sys.stdout)
+        others = {"against": str(against)} if against else {}
+        about = {"policy": policy and str(policy), **others, "attempts": attempts, "seed": seed}
+        json.dump(about | {"levels": facts}, sys.stdout)
         print()
         return
     for group in facts:
@@ -141,17 +149,37 @@ class _Entrant(NamedTuple):
     chance: bool = True  # whether attempts differ by random draws
 
 
-def _entrants(policy: Policy | None) -> dict[str, _Entrant]:
-    """Return all that play the levels, by the name that the table shows."""
-    entrants = {
-        NOTHING: _Entrant(do_nothing, chance=False),
-        "random": _Entrant(play_randomly),
-        "sticky random": _Entrant(play_sticky),
-    }
-    if policy:
-        entrants[SAMPLED] = _Entrant(play_sampled(policy.network), policy.params)
-        entrants["policy, greedy"] = _Entrant(play_most_probable(policy.network), policy.params, chance=False)
-    return entrants
+BASELINES = {
+    NOTHING: _Entrant(do_nothing, chance=False),
+    "random": _Entrant(play_randomly),
+    "sticky random": _Entrant(play_sticky),
+}
+
+
+class _Contestant(NamedTuple):
+    """A policy or an agent that is measured."""
+
+    path: Path
+    main: str  # name of the player that looks and comparisons are about
+    entrants: dict[str, _Entrant]  # by the name that the table shows
+    policy: Policy | None = None
+    agent: Agent | None = None
+
+    @property
+    def looks(self) -> Path:
+        """Path of its log of looks at sealed levels."""
+        return self.path.with_suffix(f".{LOOKS}") if self.agent else self.path / LOOKS
+
+
+def _contestant(path: Path, title: str) -> _Contestant:
+    if path.suffix == AGENT_SUFFIX:
+        name, agent = AGENT if title == POLICY else title, agent_in(path)
+        return _Contestant(path, name, {name: _Entrant(agent)}, agent=agent)
+    policy = policy_at(path)
+    sampled = _Entrant(play_sampled(policy.network), policy.params)
+    greedy = _Entrant(play_most_probable(policy.network), policy.params, chance=False)
+    main = f"{title}, sampled"
+    return _Contestant(path, main, {main: sampled, f"{title}, greedy": greedy}, policy=policy)
 
 
 def _own_experts(group: MeasuredLevels, on: str, splits: Sequence[Path], attempts: int) -> list[Specialists]:
@@ -168,11 +196,15 @@ def _measured(
     group: MeasuredLevels,
     entrants: dict[str, _Entrant],
     experts: Sequence[Specialists],
+    compared: Sequence[str],
     attempts: int,
     seed: int,
     console: Console,
 ) -> dict[str, Any]:
-    """Play one group of levels; return its facts as JSON types."""
+    """Play one group of levels; return its facts as JSON types.
+
+    With two players in `compared`, `difference` says by how much the first is better than the second.
+    """
     solved, steps = dict[str, Solved](), dict[str, Any]()
     with _shown(console, group.name, len(group.level_ids) * len(entrants)) as follow:
         for name, (player, params, chance) in entrants.items():
@@ -183,7 +215,12 @@ def _measured(
     chosen = {ALL: np.ones(len(group.level_ids), bool), NOT_TRIVIAL: ~solved[NOTHING][:, 0]}
     if group.solved is not None:
         chosen[SOLVED] = group.solved
-    return {
+    chosen = {title: some for title, some in chosen.items() if some.any()}
+    apart = {}
+    if len(compared) == 2:
+        pair = [solved[name] for name in compared]
+        apart["difference"] = {title: difference(*(each[some] for each in pair)) for title, some in chosen.items()}
+    return apart | {
         "levels": group.name,
         "start": group.start,
         "published": dict(group.published),
@@ -193,7 +230,6 @@ def _measured(
                 for name, each in solved.items()
             }
             for title, some in chosen.items()
-            if some.any()
         },
     }
 
@@ -214,6 +250,10 @@ def _print(facts: dict[str, Any], attempts: int, console: Console) -> None:
         for name, rate in facts["published"].items() if title == ALL else ():
             table.add_row(name, f"{rate:.0%}", "-", "-", "-")
         console.print(table)
+        if apart := facts.get("difference", {}).get(title):
+            low, high = (f"{100 * x:+.1f}" for x in apart["interval"])
+            say_difference = f"policy less other, one attempt, level by level: {100 * apart['rate']:+.1f} points"
+            console.print(f"{say_difference} ({low} to {high})")
         console.print()
 
 

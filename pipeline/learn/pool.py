@@ -118,8 +118,8 @@ class Feed:
         counts = np.array([len(source.train) for source in sources])
         self._weights = counts / counts.sum()
         total = int(counts.sum())
-        share = lambda count: min(count, -(-config.pool * count // total))
-        self._orders = [EpochOrder(count, share(count), config.seed) for count in counts.tolist()]
+        rounds = -(-total // config.pool)  # of an epoch, as equal as can be: its last one repeats few levels
+        self._orders = [EpochOrder(count, -(-count // rounds), config.seed) for count in counts.tolist()]
 
     def batches(self, first: int) -> Iterator[Transitions]:
         """Yield the batches of all updates from number `first` on."""

@@ -17,14 +17,15 @@ def solve_rates(solved: Solved, env_steps: Int[np.ndarray, "level attempt"] | No
     `steps` is the mean number of env steps of the attempts that reached the goal; None if none did, or if it is
     unknown. Intervals hold 95% and are over levels, because attempts at one level are not independent. The worst tenth
     is chosen by the first half of the attempts and rated on the second: rated on those that chose it, it would look
-    worse than it is. It is None for fewer than two attempts.
+    worse than it is. It includes all levels that tie with its last, so it may be larger than a tenth; its `levels` says
+    how large. It is None for fewer than two attempts.
     """
     attempts, worst = solved.shape[1], None
     if attempts > 1:
-        chosen = np.argsort(np.mean(solved[:, : attempts // 2], axis=1), kind="stable")[
-            : max(1, round(WORST * len(solved)))
-        ]
-        worst = _rate(solved[chosen, attempts // 2 :])
+        successes = np.sum(solved[:, : attempts // 2], axis=1)
+        last = np.sort(successes)[max(1, round(WORST * len(solved))) - 1]
+        chosen = successes <= last
+        worst = _rate(solved[chosen, attempts // 2 :]) | {"levels": int(chosen.sum())}
     return {
         "levels": len(solved),
         "once": _rate(solved),
@@ -32,6 +33,19 @@ def solve_rates(solved: Solved, env_steps: Int[np.ndarray, "level attempt"] | No
         "worst": worst,
         "steps": round(float(env_steps[solved].mean()), 1) if env_steps is not None and solved.any() else None,
     }
+
+
+def difference(ours: Solved, theirs: Solved) -> dict[str, Any]:
+    """Return by how much one player's solve rate exceeds another's on the same levels, with a 95% interval.
+
+    The interval is normal in the differences level by level, of which there are two more, 1 and -1, for the same reason
+    as in `interval`. It is narrower than the players' own intervals, because both find the same levels hard. Attempts
+    of the two at a level need not be equally many.
+    """
+    apart: Float[np.ndarray, " level"] = np.mean(ours, axis=1) - np.mean(theirs, axis=1)
+    apart = np.concatenate([apart, (-1.0, 1.0)])
+    mean, half = float(apart[:-2].mean()), DEVIATIONS * float(apart.std(ddof=1)) / len(apart) ** 0.5
+    return {"rate": round(mean, 4), "interval": [round(max(mean - half, -1.0), 4), round(min(mean + half, 1.0), 4)]}
 
 
 def _rate(solved: Solved) -> dict[str, Any]:

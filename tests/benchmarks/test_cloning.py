@@ -25,7 +25,10 @@ def test_cloning_measures_policies_and_keeps_them(tmp_path: Path) -> None:
     for name, draw in first.plots.items():
         draw(tmp_path / name)
         assert (tmp_path / name).read_text().rstrip().endswith("</svg>")
-    kept = [tmp_path / f"kept/s-{solved}-0" / name for name in ("sealed.json", "seen.json")]
+    kept = sorted((tmp_path / f"kept/s-{solved}-0").glob("se*-*.json"))
+    assert [file.name.partition("-")[0] for file in kept] == ["sealed", "seen"]
     before = [file.stat().st_mtime_ns for file in kept]
     assert run(args).results == first.results
     assert [file.stat().st_mtime_ns for file in kept] == before
+    args.measured = 4
+    assert {each["sealed"]["all"]["random"]["levels"] for each in run(args).results} == {4}, "not those of 8"

@@ -28,7 +28,7 @@ def test_networks_are_timed_cloned_and_kept(tmp_path: Path, monkeypatch: pytest.
     for table in first.tables:
         assert {len(row) for row in table.rows} == {len(table.head)}
     assert min(float(cell.replace(",", "")) for row in paces.rows for cell in row[1:4]) > 0
-    kept = [*(tmp_path / "kept").glob("*.json"), *(tmp_path / "kept").glob("*/sealed.json")]
+    kept = [*(tmp_path / "kept").glob("*.json"), *(tmp_path / "kept").glob("*/sealed-*.json")]
     before = [file.stat().st_mtime_ns for file in kept]
     assert len(kept) == 3
     assert kinds.run(args).results == first.results

@@ -203,6 +203,16 @@ def test_levels_weigh_equally_and_end_at_their_first_goal(split: Path) -> None:
     assert np.abs(drawn - expected).max() < 5 * expected**0.5
 
 
+def test_levels_are_read_equally_often_if_memory_holds_two_thirds_of_them(split: Path) -> None:
+    config = replace(CloneConfig(), where="", validation=0.3)
+    source = module.source_of(split, config, lambda _: None)
+    count = len(source.train) // 2 * 2
+    source = source._replace(train=source.train[:count])
+    (order,) = Feed([source], replace(config, pool=count * 2 // 3), lambda _: None)._orders
+    items, _ = order.items(range(2))
+    assert sorted(items.tolist()) == list(range(count)), "each once in an epoch of two rounds"
+
+
 def test_bad_input_is_refused(split: Path, policy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert_refused(here(["clone", "train.updates=3"], tmp_path), 2, "no split to clone")
     assert_refused(here(["clone", str(split), "train.update=3"], tmp_path), 2, "did you mean train.updates?")

@@ -1,6 +1,7 @@
 """The command that measures policies, on the shared split, level files and sealed levels."""
 
 import json
+import re
 from pathlib import Path
 
 import jax
@@ -24,7 +25,7 @@ from levelproof.pipeline.learn import published
 from levelproof.pipeline.learn.looks import LOOKS, log_look
 from levelproof.pipeline.learn.measured import levels_in, midway_levels
 from levelproof.pipeline.learn.sealed import SEALED, known_sealed
-from levelproof.pipeline.learn.solve_rates import interval, solve_rates
+from levelproof.pipeline.learn.solve_rates import difference, interval, solve_rates
 from levelproof.pipeline.learn.specialists import sealed_specialists, specialists_of
 from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.manifest import read_manifest
@@ -138,10 +139,36 @@ def test_split_in_which_nothing_is_committed_is_named(tmp_path: Path) -> None:
         (["--on", "handmade", "--where", "label = 'solved'"], "name one with --on"),
         (["--start", "0.5"], "name one with --on"),
         (["--start", "1"], "--start is 1.0"),
+        (["--against", "builtin:s"], "name the first one before it"),
     ],
 )
 def test_command_refuses(tmp_path: Path, words: list[str], sentence: str) -> None:
     assert_refused(here(["evaluate", *words], tmp_path), 2, sentence)
+
+
+@pytest.mark.slow
+def test_policies_are_compared_on_the_same_levels_and_both_looks_are_logged(tmp_path: Path) -> None:
+    """An agent against itself draws the same numbers; sealed ids in a split are sealed levels, too."""
+    act = "def act(observation, live, uniform):\n    return (uniform * [3, 3, 3, 3, 2, 2]).astype(int)\n"
+    for name in ("one.py", "two.py"):
+        (tmp_path / name).write_text(act)
+    (tmp_path / "three.py").write_text(act.replace("uniform *", "0 * uniform *"))
+    split = tmp_path / "seeds.parquet"
+    done = here(["generate", "procedure=label", "budget=16k", "levels=32", f"first_level={SEALED.start}", "out=d",
+                 "executor=inline", "search.env_steps=4096", "search.variations=0"], tmp_path)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert here(["export", "d/16k/s", "--format", "seed", "-o", str(split)], tmp_path).returncode == 0
+    (same,) = facts(tmp_path, "one.py", "--against", "two.py", "--on", str(split), "--attempts", "2")["levels"]
+    assert same["of"]["all"]["agent"] == same["of"]["all"]["other"]
+    assert same["difference"]["all"]["rate"] == 0
+    for name in ("one", "two"):
+        (look,) = (tmp_path / f"{name}.{LOOKS}").read_text().splitlines()
+        assert json.loads(look)["on"] == {
+            str(split): {"levels": 32, "solved": same["of"]["all"]["agent"]["once"]["rate"]}
+        }
+    done = here(["evaluate", "one.py", "--against", "three.py", "--levels", "32", "--attempts", "2"], tmp_path)
+    assert re.search(r"policy less other, one attempt, level by level: [+-]\d+\.\d points \([+-]", done.stdout)
+    assert not (tmp_path / f"three.{LOOKS}").read_text().count("\n") > 1
 
 
 @pytest.mark.slow
@@ -205,6 +232,45 @@ def test_worst_tenth_is_rated_on_other_attempts_than_chose_it() -> None:
     solved = np.random.default_rng(0).random((4000, 8)) < 0.5
     assert abs(solve_rates(solved, None)["worst"]["rate"] - 0.5) < 0.04
     assert solved[np.argsort(solved.mean(1))[:400]].mean() < 0.25
+
+
+def test_worst_tenth_has_all_levels_that_tie_with_its_last() -> None:
+    """Of levels that nothing tells apart, which come first does not matter."""
+    hopeless = np.zeros((300, 4), bool)
+    chosen = np.tile([False, False, True, True], (100, 1))  # not solved by the attempts that choose
+    easy = np.ones((600, 4), bool)
+    for levels in (hopeless, chosen, easy), (easy, chosen, hopeless):
+        worst = solve_rates(np.concatenate(levels), None)["worst"]
+        assert (worst["rate"], worst["levels"]) == (0.25, 400)
+    assert solve_rates(np.concatenate([hopeless[:10], easy[:90]]), None)["worst"]["levels"] == 10
+
+
+def test_difference_is_over_levels_and_narrower_than_the_players_intervals() -> None:
+    rng = np.random.default_rng(0)
+    skill = rng.random((2000, 1)) < 0.5  # whether anyone solves the level
+    ours, theirs = ((rng.random((2000, 8)) < share) & skill for share in (0.9, 0.85))
+    apart = difference(ours, theirs)
+    low, high = apart["interval"]
+    assert abs(apart["rate"] - 0.025) < 0.01
+    assert 0 < low < apart["rate"] < high
+    assert high - low < 0.5 * (interval(ours)[1] - interval(ours)[0])
+    assert difference(theirs, ours)["interval"] == [-high, -low]
+    few = difference(np.ones((4, 8), bool), np.zeros((4, 8), bool))
+    assert few["interval"][0] < 0.6, "four levels tell little"
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [(0.5, 0.5), (0.9, 0.7), (0.1, 0.15)])
+def test_intervals_of_differences_hold_the_difference_as_often_as_they_say(ours: float, theirs: float) -> None:
+    rng = np.random.default_rng(0)
+    held = []
+    for _ in range(400):
+        skill = rng.random((60, 1))
+        pair = [rng.random((60, 4)) < np.clip(2 * skill * share, 0, 1) for share in (ours, theirs)]
+        expected = np.clip(2 * np.linspace(0, 1, 10001) * ours, 0, 1).mean()
+        expected -= np.clip(2 * np.linspace(0, 1, 10001) * theirs, 0, 1).mean()
+        low, high = difference(*pair)["interval"]
+        held.append(low <= expected <= high)
+    assert np.mean(held) > 0.93
 
 
 def test_steps_are_those_of_attempts_that_reach_the_goal() -> None:
