@@ -19,6 +19,16 @@ class Learnable(NamedTuple):
     usable: Int[Array, ""]  # number of them; the others are not drawn
 
 
+def by_level(candidates: Int[Array, " candidate"], *counts: Int[Array, " candidate"]) -> tuple[Array, ...]:
+    """Add up the counts of copies, which small tables give: the luckiest copies of few levels would take all places.
+
+    Returns:
+        Distinct levels, padded to as many as there are candidates, and their counts, which are 0 where padded.
+    """
+    levels, place = jnp.unique(candidates, return_inverse=True, size=len(candidates))
+    return levels, *(jnp.zeros_like(count).at[place].add(count) for count in counts)
+
+
 @cache
 def learnability(config: CurriculumConfig) -> Curriculum:
     """Return the curriculum.
@@ -38,6 +48,7 @@ def learnability(config: CurriculumConfig) -> Curriculum:
         of_levels, of_attempts = jax.random.split(key)
         candidates = fresh(table, of_levels, config.candidates)
         episodes, solved = attempt(candidates, config.measured_steps, of_attempts)
+        candidates, episodes, solved = by_level(candidates, episodes, solved)
         rate = solved / jnp.maximum(episodes, 1)
         # As in the authors' code, n / (n + 1) holds back rates of few episodes n
         score, best = jax.lax.top_k(rate * (1 - rate) * episodes / (episodes + 1), config.keep)

@@ -94,3 +94,18 @@ def test_learnability_keeps_levels_that_are_sometimes_solved() -> None:
     assert np.isin(drawn, np.asarray(state.level_index)).mean() == pytest.approx(0.75, abs=0.05)
     never = curriculum.measure(table, lambda ids, steps, key: (jnp.ones(len(ids)), jnp.zeros(len(ids))), key)
     assert int(never.usable) == 0
+
+
+def test_learnability_adds_up_the_attempts_at_copies_of_few_levels() -> None:
+    """Level 0 is solved as often as not, but each of its copies either always or never; level 1 a quarter as often."""
+    config = CurriculumConfig(candidates=64, keep=16)
+    table = table_of(sample_levels(np.arange(5), "s"), DEFAULT_RULES)
+
+    def attempt(ids, steps, key):
+        even = jnp.cumsum(ids == 0) % 2 == 0
+        return jnp.full(len(ids), 8), jnp.select([ids == 0, ids == 1], [jnp.where(even, 8, 0), 2], 0)
+
+    curriculum = learnability(config)
+    assert curriculum.measure
+    state = curriculum.measure(table, attempt, jax.random.key(0))
+    assert sorted(np.asarray(state.level_index)[: int(state.usable)].tolist()) == [0, 1]
