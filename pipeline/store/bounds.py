@@ -6,6 +6,7 @@ dictionaries, so that a short file cannot repeat a long string a million times, 
 small; strings without a dictionary are as long as their pages.
 """
 
+import errno
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -18,6 +19,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.checksums import TAIL
 from levelproof.pipeline.store.columns import COLUMNS, OWN, REPETITIVE, schema_of
 from levelproof.pipeline.store.remote import bytes_of, is_remote
@@ -32,6 +34,8 @@ ARROW_SCHEMA = b"ARROW:schema"  # key of metadata
 WRITER = "parquet-cpp-arrow"  # from files of other writers, Arrow may read more than the footer says
 # What reading untrusted bytes can raise
 DAMAGE = (OSError, pa.ArrowException, LookupError, ValueError, TypeError, AttributeError, RuntimeError, MemoryError)
+# Errors of opening a file that is missing or of another kind
+ABSENT = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP)
 READ_OPTIONS = {
     "pre_buffer": False,
     "page_checksum_verification": True,
@@ -42,6 +46,20 @@ READ_OPTIONS = {
 
 class OtherKind(ValueError):
     """The file has the columns of another kind."""
+
+
+class DataUnread(Failure):
+    """Bytes cannot be read now, or not by this program: they may be sound, so no repair may remove them."""
+
+
+def unread(path: Path, error: BaseException | None) -> DataUnread | None:
+    """Return the error of a machine that cannot read `path`; None: the file is missing, or its bytes are damaged."""
+    if isinstance(error, MemoryError):
+        return DataUnread(f"There is too little memory to read {path}: free some, then run the same command again.")
+    if not isinstance(error, OSError) or error.errno in (None, *ABSENT):  # Arrow's errors of damage have no number
+        return None
+    reason = error.strerror or type(error).__name__
+    return DataUnread(f"{path} cannot be read ({reason}): mend that, then run the same command again.")
 
 
 @dataclass(frozen=True, eq=False)

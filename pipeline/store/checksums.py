@@ -35,7 +35,7 @@ def digests_of(path: Path, known: Iterable[str] = ()) -> dict[str, str]:
         return dict(zip(names, at_once(path, _digest, files), strict=True))
     if not stat.S_ISDIR(path.lstat().st_mode):
         return {"": _digest(path)}
-    below = sorted(Path(folder, name) for folder, _, names in os.walk(path) for name in names)
+    below = sorted(Path(folder, name) for folder, _, names in os.walk(path, onerror=_fail) for name in names)
     return {file.relative_to(path).as_posix(): _digest(file) for file in below}
 
 
@@ -48,6 +48,10 @@ def digests_below(
     """
     new = {name: digests_of(split / name) for name in names if name not in carried and (split / name).exists()}
     return dict(sorted(({name: carried[name] for name in names if name in carried} | new).items()))
+
+
+def _fail(error: OSError) -> None:
+    raise error
 
 
 def _is_below(name: str) -> bool:

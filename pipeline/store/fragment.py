@@ -16,7 +16,7 @@ from levelproof.experts.labels import Label, Source
 from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
 from levelproof.levelgen.level import size_of
 from levelproof.pipeline.errors import Failure
-from levelproof.pipeline.store.bounds import DAMAGE, bounded
+from levelproof.pipeline.store.bounds import DAMAGE, DataUnread, bounded, unread
 from levelproof.pipeline.store.columns import COLUMNS, MANIFEST_VERSION, OLDEST_VERSION, VERSIONS, completed
 from levelproof.pipeline.store.formats import CONFIG_KEY, DENSITIES_KEY, DIGESTS_KEY, HASH_KEY, SEALED_KEY, VERSION_KEY
 from levelproof.pipeline.store.layout import ids_of
@@ -50,7 +50,8 @@ def read_fragment(
 
     Raises:
         FileNotFoundError: it is missing.
-        Failure: it is damaged, or has another version.
+        DataUnread: this machine cannot read it, or it has another version.
+        Failure: it is damaged.
     """
     try:
         with bounded(path) as file:
@@ -59,7 +60,7 @@ def read_fragment(
             if not version.isdecimal():
                 raise ValueError("it has no version")
             if version not in VERSIONS:
-                raise Failure(
+                raise DataUnread(
                     f"The fragment {path} has manifest version {version[:9]}, but this program reads versions "
                     f"{OLDEST_VERSION} to {MANIFEST_VERSION}: use the levelproof that wrote it."
                 )
@@ -78,9 +79,9 @@ def read_fragment(
     except FileNotFoundError:
         raise
     except PermissionError:
-        raise Failure(f"The fragment {path} cannot be read: check its permissions.") from None
+        raise DataUnread(f"The fragment {path} cannot be read: check its permissions.") from None
     except DAMAGE as error:
-        raise Failure(
+        raise unread(path, error) or Failure(
             f"The fragment {path} is damaged ({type(error).__name__}): "
             + mended(path, f"run `levelproof verify {path.parent.parent} --repair` to regenerate its levels.")
         ) from error

@@ -32,6 +32,7 @@ from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.read.level_files import level_at
 from levelproof.pipeline.read.rows import COLUMNS as POSITION_COLUMNS
 from levelproof.pipeline.read.rows import gather_rows
+from levelproof.pipeline.store.bounds import unread
 from levelproof.pipeline.store.fields import arrays_of, same_bits, tree_of, unlike_fields
 from levelproof.pipeline.store.formats import FIRST_VERSION
 from levelproof.pipeline.store.origins import RECORD, origin_of
@@ -231,11 +232,18 @@ class Evidence:
         return {name: np.moveaxis(x, 0, -1) for name, x in arrays.items()}
 
     def _read_one(self, i: int, fields: Iterable[str] | None) -> dict[str, np.ndarray] | None:
-        """Read arrays of one level; report it and return None if it is damaged."""
+        """Read arrays of one level; report it and return None if it is damaged.
+
+        Raises:
+            DataUnread: the shard's bytes are those that were committed, but this machine cannot read them now.
+        """
         try:
             return self._read_stored(np.array([i]), fields)
         except Failure as failure:
-            self.findings.changed.add(self.columns["shard"][i])
+            name = self.columns["shard"][i]
+            if name not in self.findings.changed and (machines := unread(self.recipe.split / name, failure.__cause__)):
+                raise machines from None
+            self.findings.changed.add(name)
             self.findings.add(str(failure), [int(self.ids[i])])
             self.reported[i] = True
         return None

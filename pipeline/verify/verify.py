@@ -31,7 +31,7 @@ from levelproof.pipeline.read.level_files import level_at
 from levelproof.pipeline.read.levels import recorded_settings
 from levelproof.pipeline.read.pace import ProgressBar
 from levelproof.pipeline.runtime import prepare_jax
-from levelproof.pipeline.store.bounds import DAMAGE, MAX_ROWS, bounded
+from levelproof.pipeline.store.bounds import DAMAGE, MAX_ROWS, DataUnread, bounded, unread
 from levelproof.pipeline.store.checksums import digests_of, has_own
 from levelproof.pipeline.store.job_note import JobNote, sound_note
 from levelproof.pipeline.store.layout import (
@@ -77,7 +77,7 @@ def verify(split: Path, as_json: bool, console: Console) -> Exit:
 
     Raises:
         UserError: the split does not exist.
-        Failure: this version makes other levels, or the split mixes several configurations.
+        Failure: this version makes other levels, the split mixes several configurations, or a file cannot be read.
     """
     findings = examine(split, console)
     if as_json:
@@ -165,12 +165,18 @@ def _rows_in(path: Path) -> int:
 
 
 def _groups(paths: Sequence[Path], findings: Findings) -> Iterator[list[Part]]:
-    """Yield fragments and their rows in groups of about GROUP_ROWS rows; note damaged ones in `findings`."""
+    """Yield fragments and their rows in groups of about GROUP_ROWS rows; note damaged ones in `findings`.
+
+    Raises:
+        DataUnread: a fragment cannot be read, so that nothing is known about it.
+    """
     group: list[Part] = []
     for path in paths:
         try:
             part = _part(path)
             group += [part] if part[0].rows else []  # empty ones are fences
+        except DataUnread:
+            raise
         except Failure as failure:
             findings.fragments[path] = str(failure)
         if sum(rows.num_rows for _, rows in group) >= GROUP_ROWS or (group and path == paths[-1]):
@@ -182,14 +188,17 @@ def _part(path: Path) -> Part:
     """Read a fragment, after its checksum: parsing a damaged one can crash the process.
 
     Raises:
-        Failure: the fragment is damaged or missing.
+        DataUnread: this machine cannot read it, or it has another version.
+        Failure: it is damaged or missing.
     """
     try:
         if not has_own(path):
             raise Failure(f"The fragment {path} is not what was committed: its bytes have changed.")
         fragment, rows = read_fragment(path, ["level_id", *COLUMNS])
-    except OSError as error:
-        raise Failure(f"The fragment {path} cannot be read ({error.strerror or type(error).__name__}).") from None
+    except (OSError, MemoryError) as error:
+        if machines := unread(path, error):
+            raise machines from None
+        raise Failure(f"The fragment {path} is missing or damaged ({type(error).__name__}).") from None
     return fragment, rows
 
 
@@ -261,10 +270,12 @@ def _opened(name: str, recipe: Recipe, level_ids: set[int], findings: Findings) 
 
 
 def _changed_files(split: Path, name: str, digests: Mapping[str, str]) -> list[str]:
-    """List the files of a shard or of experts that are changed, missing or new."""
+    """List the files of a shard or of experts that are changed, missing or new. Raise DataUnread if one is unread."""
     try:
         current = digests_of(data_path(split, name), digests)
-    except (Failure, OSError):
+    except (Failure, OSError, MemoryError) as error:
+        if machines := unread(split / name, error):
+            raise machines from None
         current = {}
     return sorted(file for file in {**current, **digests} if current.get(file) != digests.get(file))
 

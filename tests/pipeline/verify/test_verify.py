@@ -1,5 +1,6 @@
 """`examine` on forged splits with valid checksums: regenerated levels, labels and witnesses expose each forgery."""
 
+import errno
 import itertools
 import json
 import shutil
@@ -17,15 +18,17 @@ from levelproof.experts.labels import WITNESSED, Label
 from levelproof.experts.witness.witness import replay
 from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
 from levelproof.pipeline.errors import StoreFailure
-from levelproof.pipeline.store import remote
+from levelproof.pipeline.store import fragment, remote
 from levelproof.pipeline.store.checksums import digests_of, with_own
-from levelproof.pipeline.store.formats import DIGESTS_KEY
+from levelproof.pipeline.store.formats import DIGESTS_KEY, VERSION_KEY
 from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.layout import MANIFEST, unit_name
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, write_index
 from levelproof.pipeline.store.shard import Shard, write_shard
 from levelproof.pipeline.verify import evidence
+from levelproof.pipeline.verify import verify as verifying
 from levelproof.pipeline.verify.verify import examine
+from tests.pipeline.command import assert_refused, here
 from tests.pipeline.made import honest_split, made_job
 from tests.pipeline.servers import files_of, serving
 
@@ -89,6 +92,13 @@ def set_another_processor(row: Row) -> None:
 
 def set_a_gpu(row: Row) -> None:
     row["device"] = "gpu: of some kind"
+
+
+def raising(error: Exception) -> Callable[..., Any]:
+    def fail(*_: Any, **__: Any) -> Any:
+        raise error
+
+    return fail
 
 
 def assert_reported(split: Path, *sentences: str) -> None:
@@ -244,6 +254,37 @@ def test_examine_bounds_the_lost_levels_of_a_damaged_fragment(split: Path, monke
     assert len(examine(split).lost) <= 102
     note_job(split, made_job(), ["levelproof", "generate"], [(0, MAX_LEVEL_ID)])
     assert len(examine(split).lost) <= 102
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(errno.EIO, "Input/output error"), PermissionError(errno.EACCES, "no"), MemoryError()]
+)
+@pytest.mark.parametrize("step", ["has_own", "read_fragment", "digests_of"])
+def test_repair_removes_nothing_that_it_cannot_read(
+    split: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, step: str
+) -> None:
+    """Whether a fragment or a shard cannot be read, and why."""
+    before = {path: path.stat().st_ino for path in split.rglob("*")}
+    failing = raising(error)
+    if step == "read_fragment":
+        monkeypatch.setattr(fragment, "bounded", failing)
+    else:
+        monkeypatch.setattr(verifying, step, failing)
+    done = here(["verify", str(split), "--repair", "executor=inline"], split.parent)
+    assert_refused(done, 1, str(split), "run the same command again" if step != "read_fragment" else "")
+    assert {path: path.stat().st_ino for path in split.rglob("*")} == before
+
+
+def test_repair_removes_no_fragment_of_another_version(split: Path) -> None:
+    path = fragment_paths(split)[0]
+    table = pq.read_table(path)
+    whole = pa.BufferOutputStream()
+    other = table.replace_schema_metadata((table.schema.metadata or {}) | {VERSION_KEY: b"99"})
+    pq.write_table(other, whole, write_page_checksum=True)
+    path.write_bytes(with_own(whole.getvalue().to_pybytes()))
+    done = here(["verify", str(split), "--repair", "executor=inline"], split.parent)
+    assert_refused(done, 1, str(path), "has manifest version 99", "use the levelproof that wrote it")
+    assert path.exists()
 
 
 def test_examine_reports_a_hostile_shard_once_and_checks_the_others(split: Path) -> None:
