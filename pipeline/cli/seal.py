@@ -10,7 +10,7 @@ EXAMPLE = """levelproof seal data/128k/s
 levelproof seal data/128k/s --density witness --key-every 16
 levelproof seal data/128k/s --density seed -o levels.parquet    one file of ids and actions; the split stays"""
 SEED = "seed"
-ROWS = "approximate number of rows per sealed fragment (default: 100,000)"
+ROWS = "approximate number of rows per sealed fragment (default: 100,000; at most 1,048,576)"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -17,6 +17,7 @@ from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store import seal as store
+from levelproof.pipeline.store.bounds import MAX_ROWS
 from levelproof.pipeline.store.disk import explaining_writes
 from levelproof.pipeline.store.job_note import note_density
 from levelproof.pipeline.store.layout import fragment_path, unit_name
@@ -46,8 +47,8 @@ def seal_split(
         Failure: the split is damaged, or a write failed; nothing is lost, and sealed fragments stay sealed.
         KeyboardInterrupt: stopped by Ctrl-C or SIGTERM; again nothing is lost.
     """
-    if rows is not None and rows < 1:
-        raise UserError(f"A sealed fragment cannot have {rows} rows: give --rows a number from 1.")
+    if rows is not None and not 1 <= rows <= MAX_ROWS:
+        raise UserError(f"A sealed fragment cannot have {rows} rows: give --rows a number from 1 to {MAX_ROWS}.")
     if key_every not in KEYS_EVERY:
         raise UserError(f"--key-every is {key_every}: choose one of {', '.join(map(str, KEYS_EVERY))}.")
     require_manifest(split, [])

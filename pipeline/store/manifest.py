@@ -23,7 +23,7 @@ from levelproof.experts.config import RECORD_STEPS
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.store import files
 from levelproof.pipeline.store.bar import with_bar
-from levelproof.pipeline.store.bounds import with_dictionaries
+from levelproof.pipeline.store.bounds import Bounded, with_dictionaries
 from levelproof.pipeline.store.checksums import digests_below, with_own
 from levelproof.pipeline.store.columns import COLUMNS, MANIFEST_VERSION, schema_of, with_current_names
 from levelproof.pipeline.store.disk import flush, flush_entry, regular
@@ -72,6 +72,7 @@ def write_fragment(
     `carried` has the digests of shards and checkpoints that earlier fragments committed and that do not change.
 
     Raises:
+        Failure: the fragment would be too large to be read; nothing is written.
         OSError: the write fails; an earlier fragment, if any, stays.
     """
     is_table = isinstance(rows, pa.Table)
@@ -86,11 +87,24 @@ def write_fragment(
     whole = pa.BufferOutputStream()
     how: Any = {"compression": "zstd", "use_dictionary": with_dictionaries(), "write_page_checksum": True}
     pq.write_table(table, whole, row_group_size=ROW_GROUP, **how)
+    data = with_own(whole.getvalue().to_pybytes())
+    _require_readable(data, attempt.fragment)
     with open(attempt.begun, "wb", opener=regular) as file:
-        file.write(with_own(whole.getvalue().to_pybytes()))
+        file.write(data)
     flush_entry(attempt.begun)
     attempt.begun.replace(attempt.fragment)
     flush_entry(attempt.fragment.parent)  # makes the fragment's name durable
+
+
+def _require_readable(data: bytes, path: Path) -> None:
+    """Raise Failure if readers would refuse this fragment: what it replaces must stay."""
+    try:
+        Bounded(pa.BufferReader(data))
+    except ValueError as error:
+        raise Failure(
+            f"The fragment {path} would be too large to be read ({error}): use a smaller --rows to seal, or a smaller "
+            "unit to generate."
+        ) from None
 
 
 def settings_metadata(config_hash: str, config: Mapping[str, Any]) -> dict[bytes, bytes]:

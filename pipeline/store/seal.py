@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 
 from levelproof.configs.schema import Density, stored_as
+from levelproof.pipeline.store.bounds import MAX_ROWS
 from levelproof.pipeline.store.checksums import altered
 from levelproof.pipeline.store.contents import ContentsError
 from levelproof.pipeline.store.files import remove
@@ -66,7 +67,7 @@ class Piece(NamedTuple):
 
 
 def plan(pieces: Iterable[Piece], rows: int) -> list[list[Piece]]:
-    """Group neighbours to merge into fragments of about `rows` rows, ascending.
+    """Group neighbours to merge into fragments of about `rows` rows, at most MAX_ROWS, ascending.
 
     Only unsealed fragments, and sealed ones with less than half of `rows`, are merged. The last group, and a group
     before a larger sealed fragment, may have fewer rows.
@@ -75,7 +76,7 @@ def plan(pieces: Iterable[Piece], rows: int) -> list[list[Piece]]:
     count = 0
     for piece in sorted(pieces):
         large = piece.sealed and 2 * piece.rows >= rows
-        if large or count >= rows:
+        if large or count >= rows or count + piece.rows > MAX_ROWS:
             groups.append([])
             count = 0
         if not large:
@@ -119,7 +120,8 @@ def seal(
         The sealed fragment.
 
     Raises:
-        Failure: a fragment or a shard is damaged, or the engine cannot convert it; nothing has changed.
+        Failure: a fragment or a shard is damaged, the engine cannot convert it, or the sealed fragment would be too
+            large to be read; nothing has changed.
         LeaseLost: another writer has the split now; nothing has changed.
         OSError: the write fails; nothing has changed.
     """

@@ -10,20 +10,25 @@ import threading
 import time
 import traceback
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from rich.console import Console
 
 from levelproof.experts.labels import Label
-from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs.schedule import WorkUnit
+from levelproof.pipeline.jobs.seal import seal_split
 from levelproof.pipeline.jobs.unit import commit
 from levelproof.pipeline.read.rows import read_row
 from levelproof.pipeline.store import manifest
 from levelproof.pipeline.store import seal as sealing
+from levelproof.pipeline.store.bounds import FRAGMENTS, MAX_ROWS, Bounded
 from levelproof.pipeline.store.layout import fragment_of, fragment_path, new_attempt, unit_name
 from levelproof.pipeline.store.leases import LeaseLost
 from levelproof.pipeline.store.leftovers import clean
@@ -118,6 +123,31 @@ def test_plan_merges_neighbours_and_keeps_large_fragments() -> None:
     crowd = [piece(100 + i, 1, False) for i in range(CROWD)]
     assert due([few, *crowd[1:]], 2 * CROWD) is None
     assert due([few, *crowd], 2 * CROWD) == crowd
+
+
+def test_plan_never_groups_more_rows_than_a_fragment_may_have() -> None:
+    parts = [Piece(fragment_path(Path(), unit_name(i, i)), MAX_ROWS // 2 - 1, False) for i in range(4)]
+    last = Piece(fragment_path(Path(), unit_name(9, 9)), 3, False)
+    assert plan([*parts, last], MAX_ROWS) == [parts[:2], [*parts[2:]], [last]]
+    assert plan([parts[0], *parts[1:]], MAX_ROWS // 2) == [parts[:2], parts[2:]]
+    assert plan([parts[0], parts[1]._replace(rows=MAX_ROWS)], MAX_ROWS) == [
+        [parts[0]],
+        [parts[1]._replace(rows=MAX_ROWS)],
+    ]
+
+
+def test_seal_refuses_fragments_that_readers_would_refuse(
+    split: Path, made: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = sorted(split.rglob("*"))
+    with pytest.raises(UserError, match=f"give --rows a number from 1 to {MAX_ROWS}"):
+        seal_split(split, MAX_ROWS + 1, Console(quiet=True))
+    with monkeypatch.context() as patched:
+        patched.setattr(manifest, "Bounded", partial(Bounded, kind=replace(FRAGMENTS, max_rows=2 * UNITS - 1)))
+        with pytest.raises(Failure, match=r"would be too large to be read .* use a smaller --rows"):
+            seal(split, pieces(split))
+    assert sorted(split.rglob("*")) == before
+    assert whole(split) == whole(made)
 
 
 def test_seal_refuses_after_another_writer_took_over(split: Path, made: Path) -> None:
