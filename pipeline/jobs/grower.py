@@ -1,5 +1,6 @@
 """A worker that grows units from seed files: simulates every witness, checks it, and commits its record."""
 
+import socket
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -17,12 +18,14 @@ from levelproof.levelgen.level import size_of
 from levelproof.pipeline.jobs.schedule import Order, Round, Summary, UnitOutcome, WorkUnit
 from levelproof.pipeline.jobs.unit import failure
 from levelproof.pipeline.read.rows import parts_of
+from levelproof.pipeline.store.checkpoints import SourceUnseen
 from levelproof.pipeline.store.contents import table_for
 from levelproof.pipeline.store.formats import Encoding
 from levelproof.pipeline.store.layout import SHARDS, new_attempt, unit_name
 from levelproof.pipeline.store.locks import committing
 from levelproof.pipeline.store.manifest import begin_fragment, read_manifest, with_places, write_fragment
 from levelproof.pipeline.store.publish import committed_levels
+from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.shard import write_shard
 
 
@@ -62,6 +65,7 @@ def grow_unit(job: GrowConfig, split: Path, unit: WorkUnit) -> Summary:
     Leaves out levels whose states differ here from the seed file's checksum, or whose witness misses the goal.
 
     Raises:
+        SourceUnseen: this process does not find the seed files of all levels.
         Failure: a seed file is damaged.
         OSError: a write failed; nothing is committed.
     """
@@ -69,6 +73,11 @@ def grow_unit(job: GrowConfig, split: Path, unit: WorkUnit) -> Summary:
     if left is None:
         return Summary(0, 0, EnvSteps())
     table = read_manifest(source, level_ids=list(left.level_ids)).table
+    if lacking := {*left.level_ids} - {*table.column("level_id").to_pylist()}:
+        raise SourceUnseen(
+            f"The worker on {socket.gethostname()} does not find level {min(lacking)} in the seed files at "
+            f"{as_typed(source)}: put them into a folder that all machines of the cluster share."
+        )
     played = np.flatnonzero(table.column("shard").is_valid())
     good, arrays = np.zeros(0, int), {}
     if len(played):

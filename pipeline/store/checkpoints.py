@@ -34,7 +34,7 @@ T = TypeVar("T")
 
 
 class SourceUnseen(Failure):
-    """A worker does not find the split that `continue_from` names."""
+    """A worker does not find the split that `continue_from` names, or the seed files that it grows."""
 
 
 def save_experts(path: Path, experts: Mapping[int, KeptExpert]) -> None:

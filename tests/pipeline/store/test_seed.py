@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,8 @@ from levelproof.levelgen.task.actions import CHOICES
 from levelproof.pipeline.errors import Exit, UserError
 from levelproof.pipeline.exchange.seed import export_seed
 from levelproof.pipeline.jobs.grow import _job, grow
-from levelproof.pipeline.jobs.grower import grow_unit
-from levelproof.pipeline.jobs.schedule import WorkUnit
+from levelproof.pipeline.jobs.grower import Grower, grow_unit
+from levelproof.pipeline.jobs.schedule import Order, WorkUnit
 from levelproof.pipeline.store.fields import arrays_of
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.seed.columns import SCHEMA, WRITTEN
@@ -228,6 +229,18 @@ def test_unit_whose_ends_were_left_out_is_committed_beside_what_it_had(split: Pa
             grow_unit(_job(path, out, INLINE, read_manifest(path, []).config or {}), out, WorkUnit(tuple(unit)))
         assert read_manifest(out).level_ids.tolist() == kept
     assert len(fragment_paths(out)) == 2
+
+
+def test_worker_that_does_not_find_the_seed_file_ends_the_job(seed: Path, tmp_path: Path) -> None:
+    """As on a machine of a cluster that lacks the file, or has an older one."""
+    manifest, out = read_manifest(seed, []), tmp_path / "128k/s"
+    out.mkdir(parents=True)
+    known, unknown = int(manifest.level_ids[0]), 10**6
+    for path, ids, missing in (tmp_path / "none.parquet", [known], known), (seed, [known, unknown], unknown):
+        job = replace(_job(seed, out, INLINE, manifest.config or {}), level_files=str(path))
+        (outcome,) = Grower(job, out).work(Order([WorkUnit(tuple(ids))]), 0).outcomes
+        assert outcome.summary is None
+        assert f"does not find level {missing} in the seed files at {path}: put them into a folder" in outcome.fatal
 
 
 def test_grow_refuses_another_name_and_foreign_settings(seed: Path, tmp_path: Path) -> None:
