@@ -5,12 +5,14 @@ import shutil
 from pathlib import Path
 
 from levelproof.pipeline.store import objects
-from levelproof.pipeline.store.disk import write_new
+from levelproof.pipeline.store.disk import flush_entry, write_new
 from levelproof.pipeline.store.remote import is_remote, stored_in
 
 
-def write(path: Path, data: bytes, mode: int = 0o666) -> None:
+def write(path: Path, data: bytes, mode: int = 0o666, durable: bool = False) -> None:
     """Write or replace a file in one step; in a folder it gets this mode, less the umask.
+
+    With `durable`, it outlasts a loss of power.
 
     Raises:
         OSError: the write fails.
@@ -21,7 +23,11 @@ def write(path: Path, data: bytes, mode: int = 0o666) -> None:
         return
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     write_new(temporary, data, mode)
+    if durable:
+        flush_entry(temporary)
     temporary.replace(path)
+    if durable:
+        flush_entry(path.parent)  # makes the file's name durable
 
 
 def remove(path: Path) -> None:

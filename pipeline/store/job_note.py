@@ -35,14 +35,14 @@ class JobNote:
 
 
 def note_job(split: Path, job: JobConfig, command: Sequence[str], wanted: Sequence[tuple[int, int]]) -> None:
-    """Record the runs of level ids that should exist after this command, as first and last of each."""
+    """Record durably the runs of level ids that should exist after this command, as first and last of each."""
     note = {
         "command": shlex.join(command),
         "level_ids": [list(run) for run in wanted],
         "config_hash": job.hash,
         "config": job.results,
     }
-    write(split / JOB, _text(note).encode())
+    write(split / JOB, _text(note).encode(), durable=True)
 
 
 def note_density(split: Path, density: str, key_every: int) -> None:
@@ -53,7 +53,7 @@ def note_density(split: Path, density: str, key_every: int) -> None:
     arguments += [f"density={density}", f"key_every={key_every}"]
     content = json.loads(_bytes(split / JOB)) | {"command": shlex.join(arguments)}
     del content[DIGEST]
-    write(split / JOB, _text(content).encode())
+    write(split / JOB, _text(content).encode(), durable=True)
 
 
 def read_note(split: Path) -> JobNote:

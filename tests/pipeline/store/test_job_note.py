@@ -9,6 +9,7 @@ import pytest
 
 from levelproof.configs.convert import plain
 from levelproof.configs.schema import hash_of
+from levelproof.pipeline.store import files
 from levelproof.pipeline.store.job_note import NoteError, note_density, note_job, read_note
 from levelproof.pipeline.store.layout import JOB
 from tests.pipeline.made import made_job
@@ -28,6 +29,16 @@ def test_read_note_returns_what_was_noted(split: Path) -> None:
     assert note.level_ids.tolist() == [[0, 7], [9, 9]]
     assert note.config == made_job().results
     assert note.intact
+
+
+def test_note_is_on_the_disk_before_it_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A repair deletes data right after noting what is lost."""
+    flushed: list[tuple[Path, bool]] = []
+    monkeypatch.setattr(files, "flush_entry", lambda path: flushed.append((path, (tmp_path / JOB).exists())))
+    note_job(tmp_path, made_job(), COMMAND, [(0, 7)])
+    ((new, there), *others) = flushed
+    assert (new.parent, new.name.startswith(f".{JOB}."), there) == (tmp_path, True, False)
+    assert others == [(tmp_path, True)]
 
 
 def test_note_density_changes_the_command(split: Path) -> None:
