@@ -18,6 +18,7 @@ from levelproof.pipeline.store.remote import is_remote
 
 MAX_BYTES = 2**25  # of a file; a run of level ids takes about 30
 DIGEST = "sha256"  # JSON key
+CONTINUED = ["generate"], ["regenerate"], ["grow"]  # commands that set a density and continue a split
 
 
 class NoteError(ValueError):
@@ -47,7 +48,7 @@ def note_job(split: Path, job: JobConfig, command: Sequence[str], wanted: Sequen
 
 def note_density(split: Path, density: str, key_every: int) -> None:
     """Change the noted command to the density that is stored now, so that it can resume."""
-    if (note := sound_note(split)) is None or shlex.split(note.command)[1:2] not in (["generate"], ["regenerate"]):
+    if (note := sound_note(split)) is None or shlex.split(note.command)[1:2] not in CONTINUED:
         return
     arguments = [arg for arg in shlex.split(note.command) if arg.partition("=")[0] not in ("density", "key_every")]
     arguments += [f"density={density}", f"key_every={key_every}"]

@@ -49,6 +49,9 @@ def test_note_density_changes_the_command(split: Path) -> None:
     assert "witness" not in note.command
     assert note.intact
     assert note.level_ids.tolist() == [[0, 7], [9, 9]]
+    note_job(split, made_job(), ["levelproof", "grow", "a.parquet", "-o", "128k/s", "density=full"], [(0, 7)])
+    note_density(split, "witness", 16)
+    assert read_note(split).command == "levelproof grow a.parquet -o 128k/s density=witness key_every=16"
     note_job(split, made_job(), ["levelproof", "import", "there"], [(0, 7)])
     note_density(split, "witness", 16)
     assert read_note(split).command == "levelproof import there"
