@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from levelproof.configs.schema import JobConfig, decisive, hash_of
+from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.store.files import write
 from levelproof.pipeline.store.layout import JOB
 from levelproof.pipeline.store.objects import get
 from levelproof.pipeline.store.remote import is_remote
 
-MAX_BYTES = 2**25  # of a file; a run of level ids takes about 30
+MAX_BYTES = 2**27  # of a file; a run of level ids takes about 25, and each level of a level file is a run
 DIGEST = "sha256"  # JSON key
 CONTINUED = ["generate"], ["regenerate"], ["grow"]  # commands that set a density and continue a split
 
@@ -36,14 +37,28 @@ class JobNote:
 
 
 def note_job(split: Path, job: JobConfig, command: Sequence[str], wanted: Sequence[tuple[int, int]]) -> None:
-    """Record durably the runs of level ids that should exist after this command, as first and last of each."""
+    """Record durably the runs of level ids that should exist after this command, as first and last of each.
+
+    Raises:
+        UserError: these are more runs than a note can have; nothing is written.
+    """
     note = {
         "command": shlex.join(command),
         "level_ids": [list(run) for run in wanted],
         "config_hash": job.hash,
         "config": job.results,
     }
-    write(split / JOB, _text(note).encode(), durable=True)
+    _store(split, note)
+
+
+def _store(split: Path, note: dict[str, Any]) -> None:
+    data = _text(note).encode()
+    if len(data) > MAX_BYTES:
+        raise UserError(
+            f"The note {split / JOB} would have {len(data):,} bytes, but no command reads more than {MAX_BYTES:,}, "
+            f"because the levels are in {len(note['level_ids']):,} runs of ids: make fewer of them in one split."
+        )
+    write(split / JOB, data, durable=True)
 
 
 def note_density(split: Path, density: str, key_every: int) -> None:
@@ -54,7 +69,7 @@ def note_density(split: Path, density: str, key_every: int) -> None:
     arguments += [f"density={density}", f"key_every={key_every}"]
     content = json.loads(_bytes(split / JOB)) | {"command": shlex.join(arguments)}
     del content[DIGEST]
-    write(split / JOB, _text(content).encode(), durable=True)
+    _store(split, content)
 
 
 def read_note(split: Path) -> JobNote:
@@ -86,7 +101,7 @@ def _bytes(path: Path) -> bytes:
         if not path.exists():
             raise FileNotFoundError(path)
         if path.is_symlink() or not path.is_file() or path.stat().st_size > MAX_BYTES:
-            raise NoteError("it is not a regular file of a few megabytes")
+            raise NoteError(f"it is not a regular file of at most {MAX_BYTES:,} bytes")
     try:
         return get(path, MAX_BYTES).data if is_remote(path) else path.read_bytes()
     except FileNotFoundError:

@@ -9,7 +9,8 @@ import pytest
 
 from levelproof.configs.convert import plain
 from levelproof.configs.schema import hash_of
-from levelproof.pipeline.store import files
+from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.store import files, job_note
 from levelproof.pipeline.store.job_note import NoteError, note_density, note_job, read_note
 from levelproof.pipeline.store.layout import JOB
 from tests.pipeline.made import made_job
@@ -29,6 +30,17 @@ def test_read_note_returns_what_was_noted(split: Path) -> None:
     assert note.level_ids.tolist() == [[0, 7], [9, 9]]
     assert note.config == made_job().results
     assert note.intact
+
+
+def test_note_job_refuses_a_note_that_no_command_would_read(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = (split / JOB).read_bytes()
+    monkeypatch.setattr(job_note, "MAX_BYTES", len(before) + 100)
+    note_job(split, made_job(), COMMAND, [(0, 7), (9, 9), (11, 11)])
+    with pytest.raises(
+        UserError, match=r"no command reads more than [\d,]+, because the levels are in 100 runs of ids"
+    ):
+        note_job(split, made_job(), COMMAND, [(2 * i, 2 * i) for i in range(100)])
+    assert read_note(split).level_ids.tolist() == [[0, 7], [9, 9], [11, 11]]
 
 
 def test_note_is_on_the_disk_before_it_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
