@@ -19,8 +19,8 @@ from levelproof.pipeline.jobs.generate import generate
 from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store.job_note import note_job, sound_note
-from levelproof.pipeline.store.layout import EXPERTS, data_paths
-from levelproof.pipeline.store.locks import without_commits
+from levelproof.pipeline.store.layout import EXPERTS, data_paths, fragment_files
+from levelproof.pipeline.store.locks import is_written, without_commits
 from levelproof.pipeline.store.mend import take_out
 from levelproof.pipeline.store.runs import merged, runs, runs_text
 from levelproof.pipeline.store.seed.file import is_seed
@@ -47,13 +47,16 @@ def repair(split: Path, settings: Sequence[str], console: Console) -> Exit:
         UserError: there is no split, it was imported or grown, another command writes to it, or a setting is not in
             SETTINGS.
         ConfigError: a setting has a wrong value.
-        Failure: it was made with settings that this program does not accept, or a write failed.
+        Failure: it was made with settings that this program does not accept, it has changed since it was examined, or
+            a write failed.
     """
     if wrong := [setting for setting in settings if setting.partition("=")[0] not in SETTINGS]:
         raise UserError(
             f"A repair uses the settings of its split: leave out {wrong[0]}; {', '.join(SETTINGS)} may change."
         )
     compose_job(settings)  # raises ConfigError for the user's own mistakes, before anything takes time
+    if is_written(split):
+        raise UserError(f"Another levelproof command is writing to {split}: wait for it, or stop it first.")
     findings = _examine_split(split, inline="executor=inline" in settings)
     print(findings.report(split))
     if not findings.wrong:
@@ -67,6 +70,7 @@ def repair(split: Path, settings: Sequence[str], console: Console) -> Exit:
     else:
         ids = lost | {i for first, last in findings.missing for i in range(first, last + 1)}
     with locked(split, partial(say, console)), without_commits(split, partial(say, console)):
+        _require_as_examined(split, findings)
         _note(split, job, findings)
         take_out(split, lost, findings.changed, list(findings.fragments))
     with taken(split, partial(say, console)):
@@ -96,6 +100,15 @@ def _examine(split: Path) -> Findings:
     from levelproof.pipeline.verify.verify import examine  # starts JAX
 
     return examine(split, Console(stderr=True))
+
+
+def _require_as_examined(split: Path, findings: Findings) -> None:
+    """Raise Failure if the split, now locked, has other fragments than when it was examined."""
+    if fragment_files(split) != findings.examined:
+        raise Failure(
+            f"Another command has changed {split} since it was examined: run the same command again, and no other one "
+            "beside it."
+        )
 
 
 def _require_generated(split: Path, findings: Findings) -> None:

@@ -142,6 +142,11 @@ def entries(split: Path, folder: str, paths: re.Pattern[str], is_kind: Callable[
         }
 
 
+def fragment_files(split: Path) -> set[tuple[Path, int]]:
+    """Return the committed fragments and what identifies their files, which any command that writes changes."""
+    return {*entries(split, MANIFEST, FRAGMENT, DirEntry.is_file).items()}
+
+
 def fragment_of(shard: Path) -> Path:
     """Return the path of the only fragment that can name this shard."""
     return fragment_path(shard.parent.parent, shard.stem.rpartition("-")[0])

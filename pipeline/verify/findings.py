@@ -24,6 +24,7 @@ class Findings:
         default_factory=list
     )  # runs of levels that the last command requested, and no fragment has
     # For repairs
+    examined: set[tuple[Path, int]] = field(default_factory=set)  # fragments at the start (`layout.fragment_files`)
     present: list[tuple[int, int]] = field(default_factory=list)  # runs of levels in sound fragments
     fragments: dict[Path, str] = field(default_factory=dict)  # damaged fragments, and why
     changed: set[str] = field(default_factory=set)  # shards and experts that differ from what was committed

@@ -36,13 +36,13 @@ from levelproof.pipeline.store.checksums import digests_of, has_own
 from levelproof.pipeline.store.job_note import JobNote, sound_note
 from levelproof.pipeline.store.layout import (
     BEGUN,
-    FRAGMENT,
     JOB,
     MANIFEST,
     attempt_of,
     data_path,
     data_paths,
     entries,
+    fragment_files,
     ids_of,
     made_within,
     unit_ids,
@@ -104,21 +104,16 @@ def examine(split: Path, console: Console | None = None) -> Findings:
     prepare_jax()
     if is_seed(split):
         return examine_seeds(split, console)
+    findings = _examine_once(split, console)
     for _ in range(ATTEMPTS - 1):
-        before = _inodes(split)
+        if not findings.wrong or fragment_files(split) == findings.examined:
+            break
         findings = _examine_once(split, console)
-        if not findings.wrong or _inodes(split) == before:
-            return findings
-    return _examine_once(split, console)
-
-
-def _inodes(split: Path) -> set[tuple[Path, int]]:
-    """Return fragments with their inode numbers: a seal changes them."""
-    return {*entries(split, MANIFEST, FRAGMENT, DirEntry.is_file).items()}
+    return findings
 
 
 def _examine_once(split: Path, console: Console | None) -> Findings:
-    findings = Findings()
+    findings = Findings(examined=fragment_files(split))
     note, paths = _note(split, findings), fragment_paths(split)
     recipe: Recipe | None = None
     named: set[str] = set()  # shards and experts that sound fragments name

@@ -18,11 +18,13 @@ from levelproof.experts.labels import WITNESSED, Label
 from levelproof.experts.witness.witness import replay
 from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
 from levelproof.pipeline.errors import StoreFailure
+from levelproof.pipeline.jobs import repair as repairing
 from levelproof.pipeline.store import fragment, remote
 from levelproof.pipeline.store.checksums import digests_of, with_own
 from levelproof.pipeline.store.formats import DIGESTS_KEY, VERSION_KEY
 from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.layout import MANIFEST, unit_name
+from levelproof.pipeline.store.locks import only_writer
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, write_index
 from levelproof.pipeline.store.shard import Shard, write_shard
 from levelproof.pipeline.verify import evidence
@@ -285,6 +287,32 @@ def test_repair_removes_no_fragment_of_another_version(split: Path) -> None:
     done = here(["verify", str(split), "--repair", "executor=inline"], split.parent)
     assert_refused(done, 1, str(path), "has manifest version 99", "use the levelproof that wrote it")
     assert path.exists()
+
+
+def test_repair_is_refused_at_once_while_another_command_writes(split: Path) -> None:
+    with only_writer(split, print):
+        done = here(["verify", str(split), "--repair", "executor=inline"], split.parent)
+    assert_refused(done, 2, f"Another levelproof command is writing to {split}")
+    assert not done.stdout
+
+
+def test_repair_does_not_act_on_what_has_changed_since(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another command replaces a damaged fragment, or seals, between the examination and the lock."""
+    damaged, examined = fragment_paths(split)[0], repairing._examine_split
+    whole = damaged.read_bytes()
+
+    def meanwhile(*args: Any, **how: Any) -> Any:
+        findings = examined(*args, **how)
+        (split / "new").write_bytes(whole)
+        (split / "new").replace(damaged)
+        return findings
+
+    damaged.write_bytes(b"PAR1")
+    monkeypatch.setattr(repairing, "_examine_split", meanwhile)
+    done = here(["verify", str(split), "--repair", "executor=inline"], split.parent)
+    assert_refused(done, 1, f"Another command has changed {split} since it was examined: run the same command again")
+    assert damaged.read_bytes() == whole
+    assert not examine(split).wrong
 
 
 def test_examine_reports_a_hostile_shard_once_and_checks_the_others(split: Path) -> None:
