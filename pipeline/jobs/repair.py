@@ -28,6 +28,7 @@ from levelproof.pipeline.store.split import locked, taken
 from levelproof.pipeline.verify.findings import Findings
 
 SETTINGS = ("executor", "workers", "unit", "device")  # settings of `generate` that a repair accepts
+STORAGE = ("density", "key_every", "keep_experts")  # settings of how results are stored
 
 
 @stoppable()
@@ -139,11 +140,13 @@ def _job(split: Path, findings: Findings, settings: Sequence[str]) -> JobConfig:
             f"The settings of {split} are lost, because no readable file has them: "
             "delete the split, and repeat the `levelproof generate` that made it."
         )
-    keep = [f"keep_experts={any(path.parent.name == EXPERTS for path in data_paths(split))}".lower()]
+    kept = findings.names_experts or any(path.parent.name == EXPERTS for path in data_paths(split))
     files = [f"level_files={split}"] if from_files(config) else []
     budget = f"budget={findings.budget or _budget(split, config['budget'])}"
     try:
-        job = compose_job([*changed_settings(config), budget, *keep, *files, *findings.stored.split(), *settings])
+        # Of settings that are named twice, the last one counts
+        how = [*_noted(split), *(["keep_experts=true"] if kept else []), *findings.stored.split()]
+        job = compose_job([*changed_settings(config), budget, *files, *how, *settings])
         job = replace(job, size=config["size"])
     except (ConfigError, ValueError, KeyError, TypeError) as error:
         raise Failure(
@@ -152,6 +155,13 @@ def _job(split: Path, findings: Findings, settings: Sequence[str]) -> JobConfig:
     if job.hash != hash_of(config):
         raise Failure(f"This levelproof would make {split} with other settings: use the version that made it.")
     return job
+
+
+def _noted(split: Path) -> list[str]:
+    """Return what the noted command says of how results are stored, which no file shows if all are damaged."""
+    note = sound_note(split)
+    words = shlex.split(note.command) if note else []
+    return [word for word in words if word.partition("=")[0] in STORAGE and "=" in word]
 
 
 def _budget(split: Path, env_steps: int) -> str:

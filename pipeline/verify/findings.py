@@ -33,6 +33,7 @@ class Findings:
     unrepairable: dict[int, str] = field(default_factory=dict)  # lost levels that this machine cannot remake, and why
     budget: str = ""  # as the user typed it
     stored: str = ""  # settings of how records are stored (`configs.schema.stored_as`)
+    names_experts: bool = False  # whether sound fragments name kept experts, lost or not
     config: dict[str, Any] | None = None  # settings that decide results
 
     def add(self, sentence: str, level_ids: Iterable[int]) -> None:

@@ -36,6 +36,7 @@ from levelproof.pipeline.store.checksums import digests_of, has_own
 from levelproof.pipeline.store.job_note import JobNote, sound_note
 from levelproof.pipeline.store.layout import (
     BEGUN,
+    EXPERTS,
     JOB,
     MANIFEST,
     attempt_of,
@@ -127,6 +128,7 @@ def _examine_once(split: Path, console: Console | None) -> Findings:
             _check_fragments(parts, recipe, findings, progress)
             ids += [rows.column("level_id").to_numpy() for _, rows in parts]
             named |= {name for fragment, _ in parts for name in fragment.digests}
+    findings.names_experts = any(name.startswith(f"{EXPERTS}/") for name in named)
     present = np.unique(np.concatenate(ids))
     findings.present = runs(present)
     say = lambda text: console and console.print(text, highlight=False, markup=False, soft_wrap=True)

@@ -29,6 +29,7 @@ from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, wr
 from levelproof.pipeline.store.shard import Shard, write_shard
 from levelproof.pipeline.verify import evidence
 from levelproof.pipeline.verify import verify as verifying
+from levelproof.pipeline.verify.findings import Findings
 from levelproof.pipeline.verify.verify import examine
 from tests.pipeline.command import assert_refused, here
 from tests.pipeline.made import honest_split, made_job
@@ -313,6 +314,25 @@ def test_repair_does_not_act_on_what_has_changed_since(split: Path, monkeypatch:
     assert_refused(done, 1, f"Another command has changed {split} since it was examined: run the same command again")
     assert damaged.read_bytes() == whole
     assert not examine(split).wrong
+
+
+def test_repair_stores_as_the_noted_command_if_no_fragment_is_left(split: Path) -> None:
+    how = ["density=witness", "key_every=16", "keep_experts=true"]
+    note_job(split, made_job(str(split.parent), *how), ["levelproof", "generate", "levels=8", *how], [(0, 7)])
+    for path in fragment_paths(split):
+        path.write_bytes(b"PAR1")
+    job = repairing._job(split, examine(split), [])
+    assert (job.stored, job.keep_experts) == ("density=witness key_every=16", True)
+
+
+def test_repair_keeps_experts_that_rows_name_if_no_file_is_left(tmp_path: Path) -> None:
+    split = honest_split(tmp_path, 4, 1, experts=True)
+    assert repairing._job(split, examine(split), []).keep_experts
+    shutil.rmtree(split / "experts")
+    assert repairing._job(split, examine(split), []).keep_experts
+    assert not repairing._job(
+        honest_split(tmp_path / "without", 4, 1), Findings(config=made_job().results), []
+    ).keep_experts
 
 
 def test_examine_reports_a_hostile_shard_once_and_checks_the_others(split: Path) -> None:
