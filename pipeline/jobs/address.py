@@ -18,6 +18,17 @@ def ray_address() -> str:
     return os.environ.get("RAY_ADDRESS", "")
 
 
+@contextmanager
+def on_this_machine() -> Iterator[None]:
+    """Ignore RAY_ADDRESS in the `with` block."""
+    address = os.environ.pop("RAY_ADDRESS", None)
+    try:
+        yield
+    finally:
+        if address is not None:
+            os.environ["RAY_ADDRESS"] = address
+
+
 def require_reachable(address: str) -> None:
     """Check that a cluster accepts connections, because Ray itself would retry for minutes.
 

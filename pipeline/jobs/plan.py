@@ -18,6 +18,7 @@ from levelproof.configs.schema import MAX_FRAME_SKIP, JobConfig
 from levelproof.experts.labels import WITNESSED, Label
 from levelproof.experts.steps import Seconds
 from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.jobs.address import on_this_machine
 from levelproof.pipeline.jobs.choice import runs_here, workers_here
 from levelproof.pipeline.jobs.forecast import LIKELY, Forecast, PerWitness, Sample, forecast
 from levelproof.pipeline.jobs.generate import generate
@@ -47,7 +48,8 @@ def plan(job: JobConfig, as_json: bool, console: Console) -> None:
     """
     if job.level_files:
         raise UserError("plan is for random levels: for level files, `generate` a few and `inspect` their costs.")
-    sample = measure(job, console)
+    with on_this_machine():
+        sample = measure(job, console)
     cost = forecast(sample, len(job.level_ids), job.workers or sample.workers, job.levels_per_unit, job.unit)
     if as_json:
         basis = {"levels": len(sample.busy), "workers": sample.workers, "wall": sample.wall, "once": sample.once}

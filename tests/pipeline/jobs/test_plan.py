@@ -1,11 +1,18 @@
 """`levelproof plan`, on a job so small that the sample is the whole job."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
+from rich.console import Console
 
+from levelproof.configs.schema import JobConfig
+from levelproof.pipeline.jobs import plan as planning
+from levelproof.pipeline.jobs.address import ray_address
 from tests.pipeline.command import TINY, assert_refused, here
+from tests.pipeline.made import made_job
 
 
 @pytest.mark.campaign
@@ -22,6 +29,33 @@ def test_plan_prints_a_forecast_and_leaves_no_file(tmp_path: Path) -> None:
         < facts["bytes"]["full"]["expected"]
     )
     assert not list(tmp_path.iterdir())
+
+
+class Begun(Exception):
+    """A sample would be made now."""
+
+
+@pytest.fixture
+def begun(monkeypatch: pytest.MonkeyPatch) -> list[tuple[JobConfig, int, str]]:
+    """Return the jobs of samples, with their levels and RAY_ADDRESS, none of which is made."""
+    jobs: list[tuple[JobConfig, int, str]] = []
+
+    def begin(job: JobConfig, *_: Any, level_ids: Sequence[int]) -> None:
+        jobs.append((job, len(level_ids), ray_address()))
+        raise Begun
+
+    monkeypatch.setattr(planning, "generate", begin)
+    return jobs
+
+
+def test_plan_ignores_the_cluster_that_the_environment_names(begun: list, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sample lies in a temporary folder of this machine."""
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:9")
+    with pytest.raises(Begun):
+        planning.plan(made_job("data", "executor=auto", "levels=16"), False, Console(quiet=True))
+    ((job, _, address),) = begun
+    assert (job.executor, address) == ("inline", "")
+    assert ray_address() == "127.0.0.1:9"
 
 
 def test_plan_rejects_level_files(tmp_path: Path) -> None:
