@@ -85,13 +85,14 @@ def report_lines(job: JobConfig, sample: Sample, cost: Forecast) -> list[str]:
 
 def measure(job: JobConfig, console: Console, seconds: float = SECONDS) -> Sample:
     """Make some of a job's first levels: a few to learn how many fit into `seconds`, then that many."""
-    levels, unit = len(job.level_ids), job.levels_per_unit
+    levels = len(job.level_ids)
+    unit = min(job.levels_per_unit, replace(job, unit=None).levels_per_unit)  # a larger one would take hours
     inline = runs_here(job, levels)
     here = workers_here(job, levels) if inline else min(job.workers or len(own_cores()), len(own_cores()))
-    job = replace(job, executor="inline" if inline else "ray")
+    job = replace(job, executor="inline" if inline else "ray", unit=job.unit and unit)
     with scratch() as folder, _announced(console, seconds):
         split, begun = split_path(str(folder), job.budget, job.size), time.monotonic()
-        some = min(levels, here * unit)
+        some = min(levels, MAX_SAMPLE, here * unit)
         first = _make(job, folder, some, here)
         here = _workers_of(split)  # fewer if memory or GPUs do not suffice for one per core
         _, busy, _ = costs_of(split)

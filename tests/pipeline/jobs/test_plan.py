@@ -11,6 +11,7 @@ from rich.console import Console
 from levelproof.configs.schema import JobConfig
 from levelproof.pipeline.jobs import plan as planning
 from levelproof.pipeline.jobs.address import ray_address
+from levelproof.pipeline.jobs.plan import MAX_SAMPLE
 from tests.pipeline.command import TINY, assert_refused, here
 from tests.pipeline.made import made_job
 
@@ -56,6 +57,20 @@ def test_plan_ignores_the_cluster_that_the_environment_names(begun: list, monkey
     ((job, _, address),) = begun
     assert (job.executor, address) == ("inline", "")
     assert ray_address() == "127.0.0.1:9"
+
+
+@pytest.mark.parametrize(("word", "unit"), [("unit=100k", 32), ("unit=3", 3), ("unit=null", None)])
+def test_plan_samples_few_levels_whatever_the_unit(
+    begun: list, word: str, unit: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(planning, "own_cores", lambda: set(range(1000)))
+    for most, cores in (1000 * (unit or 32), 1000), (unit or 32, 1):
+        with pytest.raises(Begun):
+            planning.plan(
+                made_job("data", "executor=ray", "levels=1M", f"workers={cores}", word), False, Console(quiet=True)
+            )
+        job, levels, _ = begun.pop()
+        assert (job.unit, levels) == (unit, min(most, MAX_SAMPLE))
 
 
 def test_plan_rejects_level_files(tmp_path: Path) -> None:
