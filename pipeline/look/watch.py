@@ -3,7 +3,7 @@
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -46,16 +46,19 @@ def watch(split: Path, as_json: bool, console: Console, interval: float = INTERV
 
 
 def _follow(split: Path, interval: float, show: Callable[[dict[str, Any]], None]) -> None:
+    before = [path for path in runs_in(split) if any(event["event"] == "ended" for event in events_of(path))]
     while True:
-        facts = read_progress(split)
+        facts = read_progress(split, before)
         show(facts)
         if not facts["running"] or not has_reader():
             return
         time.sleep(interval)
 
 
-def read_progress(split: Path) -> dict[str, Any]:
+def read_progress(split: Path, before: Collection[Path] = ()) -> dict[str, Any]:
     """Collect the facts that `watch` shows, as JSON types.
+
+    If the latest run is one of those that had ended `before`, but the split is being written, another one begins.
 
     Raises:
         UserError: no run has logged its state.
@@ -72,7 +75,7 @@ def read_progress(split: Path) -> dict[str, Any]:
     done, solved = state["done"], state["solved"]
     return {
         "split": as_typed(split),
-        "running": running and state["event"] != "ended",
+        "running": running and (state["event"] != "ended" or runs[-1] in before),
         "age": round(max(0.0, time.time() - state["time"]), 1),  # s since the run logged it
         **{name: value for name, value in state.items() if name not in ("time", "event")},
         "solved_share": solved / done if done else None,

@@ -44,6 +44,23 @@ def test_watch_prints_a_line_per_refresh_until_the_run_ends(split: Path, capsys:
     assert facts[-1]["done"] == 8
 
 
+def test_watch_waits_for_a_run_that_has_logged_nothing_yet(split: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It cleans the split and starts workers; the latest events are those of the run that it continues."""
+    write_events(new_run(split), [state("ended", age=60.0)])
+    later = new_run(split)
+    timers = [
+        threading.Timer(patience(0.5), lambda: write_events(later, [state("progress", done=5)])),
+        threading.Timer(patience(1.0), lambda: write_events(later, [state("ended", done=8)])),
+    ]
+    with only_writer(split, print):
+        for timer in timers:
+            timer.start()
+        watch(split, True, Console(), interval=0.1)
+    facts = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [state["running"] for state in facts] == [True] * (len(facts) - 1) + [False]
+    assert list(dict.fromkeys(state["done"] for state in facts)) == [4, 5, 8]
+
+
 def test_watch_tells_dead_runs_from_silent_ones(split: Path) -> None:
     write_events(new_run(split), [state("progress", age=600.0)])
     assert not read_progress(split)["running"]
