@@ -1,4 +1,4 @@
-"""Standard streams of a command whose reader may close its end early, as `head` does."""
+"""Standard streams of a command whose reader may close its end early, as `head` does, or whose disk may be full."""
 
 import os
 import sys
@@ -8,26 +8,26 @@ from typing import Any, TextIO, cast
 
 
 class Outlet:
-    """A standard stream that discards output once its reader has closed it.
+    """A standard stream that discards output once its reader has closed it; stderr, after any error.
 
     The command then still finishes its work, and its exit code reports the result.
     """
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
+    def __init__(self, stream: TextIO, ignored: type[OSError] = BrokenPipeError) -> None:
+        self._stream, self._ignored = stream, ignored
         self.has_reader = True
 
     def write(self, text: str) -> int:
         try:
             return self._stream.write(text)
-        except BrokenPipeError:
+        except self._ignored:
             self._drop()
             return len(text)
 
     def flush(self) -> None:
         try:
             self._stream.flush()
-        except BrokenPipeError:
+        except self._ignored:
             self._drop()
 
     def _drop(self) -> None:
@@ -48,9 +48,11 @@ def outlets() -> Iterator[None]:
     That flush ignores errors: the command itself flushes earlier, while it can still report them.
     """
     with ExitStack() as stack:
-        for stream, redirect in (sys.stdout, redirect_stdout), (sys.stderr, redirect_stderr):
+        # Progress and messages may be lost, but not results
+        both = (sys.stdout, redirect_stdout, BrokenPipeError), (sys.stderr, redirect_stderr, OSError)
+        for stream, redirect, ignored in both:
             if stream is not None:  # None if the process started with the descriptor closed
-                outlet = Outlet(stream)
+                outlet = Outlet(stream, ignored)
                 stack.callback(_flush, outlet)
                 stack.enter_context(redirect(cast(TextIO, outlet)))
         yield

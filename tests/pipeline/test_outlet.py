@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from levelproof.experts.labels import Label
+from levelproof.pipeline.outlet import Outlet
 from levelproof.pipeline.store.event_files import new_run, write_events
 from levelproof.pipeline.store.locks import only_writer
 from tests.pace import patience
@@ -67,6 +68,24 @@ def test_full_disk_below_stdout_is_an_error(split: Path) -> None:
         done = levelproof("status", str(split), stdout=full)
     assert done.returncode == 1
     assert done.stderr.startswith("Error: OSError")
+
+
+def test_full_disk_below_stderr_ends_no_command(split: Path, tmp_path: Path) -> None:
+    """Messages are lost, but neither results nor the exit code."""
+    with open("/dev/full", "w") as full:
+        assert levelproof("status", str(tmp_path / "nowhere"), stderr=full).returncode == 2
+        done = levelproof("seal", str(split), stderr=full)
+    assert done.returncode == 0
+    assert "it has 2 levels in 1 fragment now" in done.stdout
+
+
+def test_outlet_of_stderr_drops_output_after_any_error() -> None:
+    with open("/dev/full", "w") as full:
+        outlet = Outlet(full, OSError)
+        for _ in range(3):
+            assert outlet.write("x\n") == 2
+            outlet.flush()
+    assert not outlet.has_reader
 
 
 @pytest.mark.slow
