@@ -4,7 +4,7 @@ The new data is written first, then the new fragment, which takes precedence ove
 removed. If the process dies in between, `leftovers.clean` removes the rest.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
@@ -28,7 +28,9 @@ from levelproof.pipeline.store.layout import (
     data_path,
     fragment_of,
     fragment_path,
+    ids_of,
     new_attempt,
+    unit_ids,
     unit_name,
 )
 from levelproof.pipeline.store.leases import require_served
@@ -131,7 +133,7 @@ def seal(
     parts = _read(paths, moved)
     table, about = each_once(parts)[0], parts[0][0]
     shards = {name: data_path(split, name) for name in named_by([rows for _, rows in parts], "shard")}
-    replaced = [shard for shard in shards.values() if fragment_of(shard) in paths]  # no other fragment may name them
+    replaced = _replaced(split, shards, paths)
     digests = {name: files for fragment, _ in parts for name, files in fragment.digests.items()}
     _require_committed(shards, digests)
     places, between = _places(table, shards, moved), list[Path]()
@@ -168,6 +170,19 @@ def _read(paths: Iterable[Path], moved: Callable[[int], None]) -> list[tuple[Fra
 
     with ThreadPoolExecutor(THREADS) as threads:
         return list(threads.map(read, sorted(paths)))
+
+
+def _replaced(split: Path, shards: Mapping[str, Path], paths: Collection[Path]) -> list[Path]:
+    """Select the shards that no fragment but those at `paths` names.
+
+    Names say so, unless a repair has renamed the fragment of a shard, or has died before it removed the old one.
+    """
+    elsewhere = {name: shard for name, shard in shards.items() if fragment_of(shard) not in paths}
+    units = [unit_ids(shard) for shard in elsewhere.values()]
+    others = [path for path in fragment_paths(split) if path not in paths] if elsewhere else []
+    overlap = (path for path in others if any(a <= ids_of(path)[1] and ids_of(path)[0] <= b for a, b in units))
+    named = named_by([read_fragment(path, ["shard"])[1] for path in overlap], "shard")
+    return [shard for name, shard in shards.items() if name not in elsewhere or name not in named]
 
 
 def _require_committed(shards: Mapping[str, Path], digests: Mapping[str, Mapping[str, str]]) -> None:

@@ -40,6 +40,7 @@ from levelproof.pipeline.store.manifest import (
     read_manifest,
     write_fragment,
 )
+from levelproof.pipeline.store.mend import take_out
 from levelproof.pipeline.store.seal import CROWD, Piece, due, plan, seal
 from levelproof.pipeline.store.shard import Shard
 from tests.pace import patience
@@ -163,6 +164,28 @@ def test_seal_refuses_after_another_writer_took_over(split: Path, made: Path) ->
             assert_tidy(split, UNITS)
             seal(same, pieces(same))
     assert_tidy(split, 1)
+
+
+def test_seal_removes_the_shard_of_a_fragment_that_a_repair_has_renamed(split: Path, made: Path) -> None:
+    take_out(split, {1}, [], [])
+    assert fragment_path(split, unit_name(0, 0)).exists()
+    seal(split, pieces(split))
+    expected = whole(made)
+    del expected[1]
+    assert whole(split) == expected
+    assert_tidy(split, 1)
+
+
+def test_seal_keeps_a_shard_that_another_fragment_names(split: Path) -> None:
+    """A repair has died between its new fragment and the removal of the old one."""
+    old = fragment_path(split, unit_name(0, 1))
+    before, shards = old.read_bytes(), read_fragment(old)[0].digests
+    take_out(split, {1}, [], [])
+    old.write_bytes(before)
+    seal(split, [piece for piece in pieces(split) if piece.path != old])
+    assert shards
+    assert all((split / name).exists() for name in shards)
+    assert not list((split / "manifest").glob(".*"))
 
 
 def test_units_commit_into_the_range_of_a_seal(split: Path, made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
