@@ -12,6 +12,7 @@ import numpy as np
 
 from levelproof.configs.schema import JobConfig, decisive, hash_of
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.store.bounds import unread
 from levelproof.pipeline.store.files import write
 from levelproof.pipeline.store.layout import JOB
 from levelproof.pipeline.store.objects import get
@@ -78,6 +79,7 @@ def read_note(split: Path) -> JobNote:
     Raises:
         FileNotFoundError: there is none.
         NoteError: it is invalid.
+        DataUnread: this machine cannot read it.
     """
     data = _bytes(split / JOB)
     try:
@@ -106,12 +108,12 @@ def _bytes(path: Path) -> bytes:
         return get(path, MAX_BYTES).data if is_remote(path) else path.read_bytes()
     except FileNotFoundError:
         raise
-    except OSError as error:
-        raise NoteError(type(error).__name__) from None
+    except (OSError, MemoryError) as error:
+        raise unread(path, error) or NoteError(type(error).__name__) from None
 
 
 def sound_note(split: Path) -> JobNote | None:
-    """Read the note of a split; None if it is damaged or missing."""
+    """Read the note of a split; None if it is damaged or missing. Raise DataUnread if this machine cannot read it."""
     try:
         note = read_note(split)
     except (FileNotFoundError, NoteError):

@@ -23,7 +23,7 @@ from levelproof.pipeline.store import fragment, remote
 from levelproof.pipeline.store.checksums import digests_of, with_own
 from levelproof.pipeline.store.formats import DIGESTS_KEY, VERSION_KEY
 from levelproof.pipeline.store.job_note import note_job
-from levelproof.pipeline.store.layout import MANIFEST, unit_name
+from levelproof.pipeline.store.layout import JOB, MANIFEST, unit_name
 from levelproof.pipeline.store.locks import only_writer
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, write_index
 from levelproof.pipeline.store.shard import Shard, write_shard
@@ -262,15 +262,18 @@ def test_examine_bounds_the_lost_levels_of_a_damaged_fragment(split: Path, monke
 @pytest.mark.parametrize(
     "error", [OSError(errno.EIO, "Input/output error"), PermissionError(errno.EACCES, "no"), MemoryError()]
 )
-@pytest.mark.parametrize("step", ["has_own", "read_fragment", "digests_of"])
+@pytest.mark.parametrize("step", ["has_own", "read_fragment", "digests_of", JOB])
 def test_repair_removes_nothing_that_it_cannot_read(
     split: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, step: str
 ) -> None:
-    """Whether a fragment or a shard cannot be read, and why."""
+    """Whether a fragment, a shard or the note cannot be read, and why."""
     before = {path: path.stat().st_ino for path in split.rglob("*")}
     failing = raising(error)
     if step == "read_fragment":
         monkeypatch.setattr(fragment, "bounded", failing)
+    elif step == JOB:
+        read = Path.read_bytes
+        monkeypatch.setattr(Path, "read_bytes", lambda path: failing() if path.name == JOB else read(path))
     else:
         monkeypatch.setattr(verifying, step, failing)
     done = here(["verify", str(split), "--repair", "executor=inline"], split.parent)
