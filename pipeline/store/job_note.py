@@ -18,7 +18,7 @@ from levelproof.pipeline.store.layout import JOB
 from levelproof.pipeline.store.objects import get
 from levelproof.pipeline.store.remote import is_remote
 
-MAX_BYTES = 2**27  # of a file; a run of level ids takes about 25, and each level of a level file is a run
+MAX_BYTES = 2**26  # of a file; a run of level ids takes about 25, and each level of a level file is a run
 DIGEST = "sha256"  # JSON key
 CONTINUED = ["generate"], ["regenerate"], ["grow"]  # commands that set a density and continue a split
 
