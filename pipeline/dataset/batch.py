@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
 
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.witness.witness import Record
@@ -98,6 +99,15 @@ def expand_fields(fields: Iterable[str], size: Size) -> list[str]:
             raise UserError(f"There is no field {prefix!r}{hint}: levelproof.Record and levelproof.Level list them.")
         chosen += matches
     return list(dict.fromkeys(chosen))
+
+
+def whole_numbers(values: ArrayLike, what: str) -> Int[np.ndarray, "..."]:
+    """Convert to int64. Raise UserError if these are not integers, such as a mask or fractions."""
+    given = np.asarray(values)
+    if given.size and given.dtype.kind not in "iu":
+        way = "pass np.flatnonzero(mask) in place of a mask" if given.dtype.kind == "b" else "convert them to integers"
+        raise UserError(f"The {what} must be integers, not of the type {given.dtype}: {way}.")
+    return given.astype(np.int64)
 
 
 def require_steps(steps: np.ndarray) -> None:

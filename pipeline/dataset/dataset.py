@@ -18,7 +18,7 @@ from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.environment import EnvState
 from levelproof.levelgen.task.observe.kinds import ObservationType
 from levelproof.physics.types import Size, State
-from levelproof.pipeline.dataset.batch import Batch, expand_fields, require_steps, state_in, timed_out
+from levelproof.pipeline.dataset.batch import Batch, expand_fields, require_steps, state_in, timed_out, whole_numbers
 from levelproof.pipeline.dataset.batches import Batches, batches_of
 from levelproof.pipeline.dataset.differing import KEEP, Differing
 from levelproof.pipeline.dataset.episodes import EpisodeBatch, gather_episodes
@@ -154,8 +154,8 @@ class Dataset:
             Failure: the data is damaged.
         """
         windows, kind, chosen = Windows.of(length), parse_observation(observation), expand_fields(fields, self.size)
-        indices = np.atleast_1d(np.asarray(indices, np.int64))
-        starts = np.broadcast_to(np.asarray(first, np.int64), indices.shape)
+        indices = np.atleast_1d(whole_numbers(indices, "indices"))
+        starts = np.broadcast_to(whole_numbers(first, "first steps"), indices.shape)
         require_steps(starts)
         needed = [*chosen, *ALWAYS_FIELDS, *expand_fields(["level", *(["record/state"] if kind else [])], self.size)]
         whole = self._arrays(indices, needed)
@@ -250,7 +250,7 @@ class Dataset:
         """
         kind, chosen = parse_observation(observation), expand_fields(fields, self.size)
         gather = lambda rows: gather_episodes(self.split, rows, chosen, kind, self._shard, self._differing.note)
-        read = self._trajectories.gathered(np.atleast_1d(np.asarray(indices, np.int64)), gather)
+        read = self._trajectories.gathered(np.atleast_1d(whole_numbers(indices, "indices")), gather)
         return replace(read, mask=read.mask & self._differing.kept(read.level_id)[read.episode])
 
     def episode_batches(
@@ -314,7 +314,7 @@ class Dataset:
             UserError: an index does not exist.
             Failure: the data is damaged.
         """
-        arrays = self._arrays(np.atleast_1d(np.asarray(indices, np.int64)), expand_fields(["level"], self.size))
+        arrays = self._arrays(np.atleast_1d(whole_numbers(indices, "indices")), expand_fields(["level"], self.size))
         return jax.tree.map(lambda x: np.ascontiguousarray(np.moveaxis(x, 0, -1)), tree_of(Level, arrays, "level/"))
 
     @renamed(number="index")
@@ -331,7 +331,7 @@ class Dataset:
             UserError: an index or a step does not exist.
             Failure: the data is damaged.
         """
-        indices, steps = np.broadcast_arrays(np.asarray(index, np.int64), np.asarray(step, np.int64))
+        indices, steps = np.broadcast_arrays(whole_numbers(index, "indices"), whole_numbers(step, "steps"))
         require_steps(steps)
         fields = expand_fields(["level", "record/state", "record/timestep", "record/last_distance"], self.size)
         return state_in(self._arrays(indices.ravel(), fields), indices, steps)

@@ -244,3 +244,12 @@ def test_open_read_and_state_reject_invalid_arguments(split: Path, tmp_path: Pat
             open(split).state(0, step)
         with pytest.raises(UserError, match=rf"There are no steps \[{step}\] in a record"):
             open(split).read([0], first=step)
+
+
+@pytest.mark.parametrize("read", ["read", "levels", "episodes", "state"])
+def test_masks_and_fractions_are_no_indices(data: Dataset, read: str) -> None:
+    """They would read the trajectories 0 and 1 again and again."""
+    with pytest.raises(UserError, match=r"must be integers, not of the type bool: pass np\.flatnonzero\(mask\)"):
+        getattr(data, read)(np.arange(len(data)) % 2 == 0)
+    with pytest.raises(UserError, match="The indices must be integers, not of the type float64: convert them"):
+        getattr(data, read)([0.5, 1.0])
