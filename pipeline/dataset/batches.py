@@ -48,11 +48,11 @@ class Batches(Iterator[T], Generic[T]):
         self._together, self._next = together, self._position  # the position that is loaded next
         self._loaded: deque[T] = deque()
         self._ahead: deque[Future[Sequence[T]]] = deque()
-        self._max_ahead = -(-(max(prefetch, 0) + 1) // together)
+        self._most = max(prefetch + 1, together)  # the batch that is returned next, and those ahead of it
         self._end = weakref.finalize(self, self._pool.shutdown, wait=False, cancel_futures=True)
 
     def __next__(self) -> T:
-        while self._end.alive and len(self._ahead) < self._max_ahead and (some := self._positions()):
+        while self._end.alive and self._has_room() and (some := self._positions()):
             self._ahead.append(self._pool.submit(self._load, some))
             self._next = some.stop
         if not self._loaded:
@@ -77,6 +77,9 @@ class Batches(Iterator[T], Generic[T]):
         self._loaded.clear()
         self._end()
 
+    def _has_room(self) -> bool:
+        return self._next - self._position + self._together <= self._most
+
     def _positions(self) -> range:
         """Return the positions to load next; none at the end."""
         stop = self._next + self._together
@@ -92,13 +95,18 @@ def batches_of(
     start: Any,
     together: int = 1,
 ) -> Batches[T]:
-    """Iterate over the batches of epochs in an order. Other arguments as `Batches`; `prefetch` None: two per core."""
+    """Iterate over the batches of epochs in an order.
+
+    Other arguments as `Batches`; `prefetch` None: two loads per core. Else one load returns at most half the batches
+    that may be in memory, so that the next load can begin before they are used up.
+    """
     if epochs is not None and epochs < 0:
         raise UserError(f"epochs is {epochs}: it must be at least 0, or None for endless batches.")
     settings |= {"batch_size": order.batch_size, "seed": order.seed, "process_count": order.process_count}
     count = None if epochs is None else epochs * order.batches
-    ahead = 2 * together * len(own_cores()) if prefetch is None else prefetch
-    return Batches(load, count, settings, ahead, start, together)
+    if prefetch is None:
+        return Batches(load, count, settings, 2 * together * len(own_cores()), start, together)
+    return Batches(load, count, settings, max(prefetch, 0), start, max(1, min(together, (prefetch + 1) // 2)))
 
 
 def _position_in(start: Any, settings: Mapping[str, Any]) -> int:

@@ -268,9 +268,10 @@ class Dataset:
     ) -> Batches[EpisodeBatch]:
         """Iterate over batches of first episodes, which threads prefetch, many batches at once.
 
-        Takes the arguments of `batches`, and raises what it raises. `mask` is False in padding.
+        Takes the arguments of `batches`, and raises what it raises. `mask` is False in padding. Without `prefetch`,
+        two loads per core are read ahead, each of some thousand episodes, or of one batch with pixels.
         """
-        indices, fields, _ = self._subset(subset), expand_fields(fields, self.size), parse_observation(observation)
+        indices, fields, kind = self._subset(subset), expand_fields(fields, self.size), parse_observation(observation)
         order = EpochOrder(len(indices), batch_size, seed, process_index, process_count)
 
         def load(positions: range) -> list[EpisodeBatch]:
@@ -278,7 +279,7 @@ class Dataset:
             read = self.episodes(indices[items], fields, observation)
             return replace(read, mask=read.mask & new[read.episode]).parts(batch_size)
 
-        together = max(1, EPISODES_AT_ONCE // batch_size)
+        together = 1 if kind == ObservationType.PIXELS else max(1, EPISODES_AT_ONCE // batch_size)
         settings = self._settings(subset=subset, episodes="first")
         return batches_of(load, order, settings, epochs, prefetch, start, together)
 

@@ -109,6 +109,16 @@ def test_batches_read_ahead_exactly_prefetch_batches() -> None:
         next(batches)
 
 
+def test_batches_loaded_together_stay_within_prefetch() -> None:
+    requested: list[int] = []
+    batches = Batches(lambda positions: requested.extend(positions) or positions, None, {}, 3, None, together=2)
+    for position in range(6):
+        assert next(batches) == position
+        time.sleep(0.05)  # time in which too much could be requested
+        assert len(requested) <= position + 1 + 3
+    batches.close()
+
+
 @pytest.mark.campaign
 def test_batches_use_bounded_memory(data: Dataset) -> None:
     """A million trajectories are read, by many epochs of a small split."""

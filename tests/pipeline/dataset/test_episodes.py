@@ -86,6 +86,20 @@ def test_episode_batches_yield_each_episode_once(seeds: Path) -> None:
                                                "mask": batch.mask}))  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ("prefetch", "observation", "most"), [(0, None, 2), (3, None, 4), (None, None, 1024), (None, "pixels", 2)]
+)
+def test_episode_batches_read_no_more_at_once_than_asked_for(
+    data: Dataset, monkeypatch: pytest.MonkeyPatch, prefetch: int | None, observation: str | None, most: int
+) -> None:
+    plain, counts = data.episodes, []
+    monkeypatch.setattr(data, "episodes", lambda some, *_: counts.append(len(some)) or plain(some, observation=None))
+    batches = data.episode_batches(2, observation=observation, prefetch=prefetch)
+    ids = np.concatenate([batch.level_id for batch in batches])
+    assert set(ids.tolist()) == set(data.manifest["level_id"].to_pylist())
+    assert max(counts) == min(most, 2 * -(-len(data) // 2))
+
+
 def indices_of(data: Dataset, batch: EpisodeBatch) -> np.ndarray:
     return np.searchsorted(data.manifest["level_id"].to_numpy(), batch.level_id)
 
