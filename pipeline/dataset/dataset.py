@@ -294,7 +294,7 @@ class Dataset:
         """Return single trajectories or windows, as a data source for grain or a dataset for a torch DataLoader.
 
         Takes the arguments of `batches`. Elements are dictionaries of numpy arrays [time, ...]: the attributes of
-        `Batch`, and the fields.
+        `Batch`, and the fields. Observations of several arrays (`pixels`, `symbolic_entity`) are dictionaries, too.
 
         Raises:
             UserError: an argument is invalid, or the subset is empty.

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import is_dataclass
 from typing import Any, Protocol
 
 import jax
@@ -80,4 +81,6 @@ class TrajectorySource:
 
 def _element(batch: Batch, i: int) -> dict[str, Any]:
     element = {name: x for name, x in vars(batch).items() if name != "fields" and x is not None} | batch.fields
+    if is_dataclass(shown := batch.observation):
+        element["observation"] = vars(shown)  # torch's default collation refuses dataclasses
     return jax.tree.map(lambda x: np.array(np.asarray(x)[i]), element)

@@ -26,6 +26,18 @@ def test_source_elements_are_windows_by_name(data: Dataset) -> None:
         source[len(source)]
 
 
+def test_observations_of_several_arrays_are_dictionaries(data: Dataset) -> None:
+    """As loaders collate them."""
+    shown, whole = (
+        data.torch(observation="symbolic_entity")[0]["observation"],
+        data.read([0], observation="symbolic_entity"),
+    )
+    assert shown.keys() == vars(whole.observation).keys()
+    for name, values in shown.items():
+        assert type(values) is np.ndarray
+        assert np.array_equal(values, getattr(whole.observation, name)[0]), name
+
+
 def test_source_pickles_small_and_restores(data: Dataset) -> None:
     source = data.grain(subset="train", length=64, observation=None)
     pickled = pickle.dumps(source)
@@ -95,7 +107,8 @@ def test_grain_loads_shuffles_and_batches_a_source(data: Dataset, workers: int) 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize(
-    ("context", "observation"), [("fork", None), ("spawn", None), ("spawn", "symbolic_flat"), (None, "symbolic_flat")]
+    ("context", "observation"),
+    [("fork", None), ("spawn", None), ("spawn", "symbolic_flat"), (None, "symbolic_flat"), (None, "symbolic_entity")],
 )
 def test_torch_dataloader_accepts_a_source(data: Dataset, context: str | None, observation: str | None) -> None:
     torch = pytest.importorskip("torch")
