@@ -67,7 +67,7 @@ def read_level_file(path: str | os.PathLike[str]) -> LevelFile:
         raise LevelFileError(f"Cannot use the level file {path}: {error}.") from None
 
 
-def write_level_file(file: LevelFile, path: Path) -> None:
+def write_level_file(file: LevelFile, path: str | os.PathLike[str]) -> None:
     """Write a level as JSON that Kinetix and its editor open; the file appears whole or not at all.
 
     Raises:
@@ -76,6 +76,7 @@ def write_level_file(file: LevelFile, path: Path) -> None:
         OSError: the file cannot be written.
     """
     text = json.dumps(to_document(file)) + "\n"
+    path = Path(path)
     unfinished = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         unfinished.write_text(text)
