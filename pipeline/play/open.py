@@ -16,7 +16,7 @@ from levelproof.levelgen.files.level_file import LevelFile
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look.gallery.attempts import Contender
 from levelproof.pipeline.play.server import HOST, serving
-from levelproof.pipeline.play.session import empty_file, witness_in
+from levelproof.pipeline.play.session import empty_file, require_playable, witness_in
 from levelproof.pipeline.read.levels import find_level, is_level_file, level_file, levels_of, rules_of
 from levelproof.pipeline.read.policies import policy_at
 from levelproof.pipeline.read.rows import read_row
@@ -29,7 +29,8 @@ def play(
     """Serve the page until Ctrl-C, and open it if `browser`; the page lets the policy in the folder `policy` play.
 
     Raises:
-        UserError: no such level, size, budget or policy, the file cannot be read, or the port is invalid or taken.
+        UserError: no such level, size, budget or policy, the file cannot be read or its env steps take too long, or the
+            port is invalid or taken.
         Failure: the split is damaged.
     """
     prepare_jax()
@@ -53,19 +54,19 @@ def play(
 
 
 def level_to_play(source: Path | None, level_id: int | None, size: str | None) -> tuple[LevelFile, np.ndarray | None]:
-    """Load the level to play with its rules, and the actions [step, 6] of its witness or None."""
+    """Load the level to play with its rules, and the actions [step, 6] of its witness or None. Errors as `play`."""
     if source is None:
         return empty_file(size or "m"), None
     if size is not None:
         raise UserError(f"--size is for an empty level: leave it out, or {source}.")
     if is_level_file(source):
-        file = level_file(source, level_id)
+        file = require_playable(level_file(source, level_id))
         return file, witness_in(json.loads(source.read_bytes()), file)
     if level_id is None:
         raise UserError(f"Which level of {source}? Add its id: `levelproof inspect {source}` lists them.")
     manifest, row = find_level(source, level_id)
     level = jax.tree.map(np.asarray, levels_of(manifest, manifest.table))
-    file = LevelFile(level, rules_of(manifest))
+    file = require_playable(LevelFile(level, rules_of(manifest)))
     if not row["shard"]:
         return file, None
     stored = read_row(manifest.split, row, ["record/action", "record/done"])

@@ -23,6 +23,7 @@ from levelproof.levelgen.task.rules import TaskParams, TaskState
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look.gallery.attempts import Contender
 from levelproof.pipeline.look.gallery.worlds import drawn_bodies, world_of
+from levelproof.pipeline.look.show import MAX_FRAME_SKIP
 from levelproof.pipeline.version import __version__
 
 WITNESS = "witness"  # entry of a level file with actions that solve the level; other programs ignore it
@@ -125,7 +126,7 @@ class Session:
 
     def load(self, request: Message) -> Message:
         """Open a level file's `document`."""
-        file = from_document(request["document"])
+        file = require_playable(from_document(request["document"]))
         return self._open(file, witness_in(request["document"], file))
 
     def save(self, _: Message) -> Message:
@@ -223,6 +224,16 @@ def places_of(
     bodies, _ = drawn_bodies(one_of(level))
     places = np.concatenate([position, rotation[..., None]], -1)[:, bodies]
     return np.nan_to_num(places).reshape(len(places), -1).round(4).tolist()
+
+
+def require_playable(file: LevelFile) -> LevelFile:
+    """Return the file. Raise UserError if an env step of its rules would take too long to play."""
+    if (steps := file.rules.frame_skip) > MAX_FRAME_SKIP:
+        raise UserError(
+            f"This level's rules take {steps:,} physics steps per env step, and the player at most {MAX_FRAME_SKIP}: "
+            "choose another level, or lower its frame_skip."
+        )
+    return file
 
 
 def witness_in(document: Any, file: LevelFile) -> np.ndarray | None:

@@ -20,7 +20,7 @@ from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, i
 from levelproof.experts.networks.saved import Policy
 from levelproof.experts.search.config import SearchConfig
 from levelproof.experts.witness.witness import replay, succeeds
-from levelproof.levelgen.files.level_file import from_document, write_level_file
+from levelproof.levelgen.files.level_file import from_document, to_document, write_level_file
 from levelproof.levelgen.level import SIZES
 from levelproof.physics.types import Size
 from levelproof.pipeline.errors import UserError
@@ -186,3 +186,14 @@ def test_play_refuses_unplayable_arguments(split: Path, tmp_path: Path, address:
     with pytest.raises(UserError, match="leave out"):
         level_to_play(level, 1, None)
     assert level_to_play(level, None, None)[1] is None
+
+
+def test_level_whose_steps_take_minutes_is_refused(page: ClientConnection, tmp_path: Path) -> None:
+    """Whether it is named or opened on the page, before its witness is replayed."""
+    path, document = tmp_path / "level.json", to_document(empty_file("s"))
+    document["static_env_params"]["frame_skip"] = 1_000_000
+    document["witness"] = {"actions": [[0] * 6] * RECORD_STEPS}
+    path.write_text(json.dumps(document))
+    with pytest.raises(UserError, match="take 1,000,000 physics steps per env step, and the player at most 8: choose"):
+        level_to_play(path, None, None)
+    assert "lower its frame_skip" in ask(page, "load", document=document)["error"]
