@@ -51,8 +51,18 @@
       this.level = level;
       at("undo").disabled = !level.undo;
       at("redo").disabled = !level.redo;
-      if (this.stage.selected && !this.stage.pointOf(this.stage.selected)) this.stage.selected = null;
-      this.describeSelection();
+      this.select(this.found(this.stage.selected));
+    }
+
+    // The numbers of all entities of a kind, in drawing order.
+    numbers(kind) {
+      return this.level[{ body: "bodies", joint: "joints", thruster: "thrusters" }[kind]];
+    }
+
+    // The same entity in the current level, whose drawing order may differ; null if it is gone.
+    found(entity) {
+      const index = entity ? this.numbers(entity.kind).indexOf(entity.number) : -1;
+      return index < 0 ? null : { ...entity, index };
     }
 
     async change(name, fields) {
@@ -87,17 +97,14 @@
         const entities = kind === "joint" ? this.stage.world.joints : this.stage.world.thrusters;
         for (let index = 0; index < entities.length; index++) {
           const point = this.stage.pointOf({ kind, index });
-          if (Math.hypot(point[0] - x, point[1] - y) < NEAR) return this.select({ kind, index });
+          if (Math.hypot(point[0] - x, point[1] - y) < NEAR) return this.select({ kind, index, number: this.numbers(kind)[index] });
         }
       }
       this.drag = { from: [x, y] };
       const { bodies } = await this.link.ask("at", { x, y });
-      const index = this.level.bodies.indexOf(bodies[0]);
-      this.select(index < 0 ? null : { kind: "body", index });
-      if (this.drag && index >= 0 && bodies[0] >= 4) {
-        this.drag.index = index;
-        this.drag.start = this.stage.pointOf({ kind: "body", index });
-      }
+      const entity = this.found({ kind: "body", number: bodies[0] });
+      this.select(entity);
+      if (this.drag && entity && entity.number >= 4) Object.assign(this.drag, { ...entity, start: this.stage.pointOf(entity) });
     }
 
     moved(event) {
@@ -117,7 +124,7 @@
       const [dx, dy] = [x - drag.from[0], y - drag.from[1]];
       const far = Math.hypot(dx, dy) > 0.02;
       if (this.tool === "thruster") await this.edit("add_thruster", ...drag.from, far ? Math.atan2(dy, dx) : Math.PI / 2);
-      else if (far && drag.index !== undefined) await this.edit("move", this.level.bodies[drag.index], drag.start[0] + dx, drag.start[1] + dy);
+      else if (far && drag.index !== undefined) await this.edit("move", drag.number, drag.start[0] + dx, drag.start[1] + dy);
     }
 
     select(entity) {
@@ -130,19 +137,20 @@
     describeSelection() {
       const entity = this.stage.selected;
       at("selected").hidden = !entity;
+      this.remove = null;
       if (!entity) return;
-      const { kind, index } = entity;
-      const number = this.level[{ body: "bodies", joint: "joints", thruster: "thrusters" }[kind]][index];
-      const remove = this.button("Delete", () => { this.stage.selected = null; this.edit("delete", kind, number); });
+      const { kind, index, number } = entity;
+      const scenery = kind === "body" && number < 4; // it cannot be deleted
+      const remove = () => { this.stage.selected = null; this.edit("delete", kind, number); };
+      if (!scenery) this.remove = this.button("Delete", remove);
       if (kind !== "body") {
         const { binding, fixed } = (kind === "joint" ? this.stage.world.joints : this.stage.world.thrusters)[index];
         at("what").textContent = fixed ? "Fixed joint" : `${kind === "joint" ? "Motor" : "Thruster"}, obeys ${levelproof.entryName(binding)}`;
         const next = (kind === "joint" ? binding : binding - 4) + 1;
-        at("deeds").replaceChildren(...(fixed ? [] : [this.button("Next control", () => this.edit("bind", kind, number, next))]), remove);
+        at("deeds").replaceChildren(...(fixed ? [] : [this.button("Next control", () => this.edit("bind", kind, number, next))]), this.remove);
         return;
       }
       const [role, fixed] = [this.stage.world.bodies[index].role, this.level.fixed[index]];
-      const scenery = number < 4;
       at("what").textContent = `${role[0].toUpperCase()}${role.slice(1)} body${fixed ? ", cannot move" : ""}`;
       const roles = this.level.roles.map((name, value) =>
         this.button(name, () => this.edit("set_role", number, value), { "aria-pressed": name === role }));
@@ -152,7 +160,7 @@
         this.button("Turn ↻", () => this.edit("turn", number, -TURN)),
         this.button("Larger", () => this.edit("resize", number, GROW)),
         this.button("Smaller", () => this.edit("resize", number, 1 / GROW)),
-        remove,
+        this.remove,
       ]));
     }
 
@@ -160,7 +168,7 @@
       if (/^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName)) return;
       const isUndo = (event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z";
       if (isUndo) this.change(event.shiftKey ? "redo" : "undo");
-      else if (event.key === "Delete" && this.stage.selected) [...at("deeds").children].at(-1).click();
+      else if (event.key === "Delete" && this.remove) this.remove.click();
       else return;
       event.preventDefault();
     }

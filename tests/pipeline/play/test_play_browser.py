@@ -96,6 +96,27 @@ def test_page_builds_edits_plays_and_saves_a_level(page: Any, tmp_path: Path) ->
     assert page.locator("#watch").is_enabled()
 
 
+def test_selection_stays_with_its_body_when_the_drawing_order_changes(page: Any) -> None:
+    """Immovable bodies are drawn first."""
+    place(page, "Rectangle", 4.0, 0.7, "blue")
+    place(page, "Circle", 1.0, 0.7, "green")
+    button(page, "Fix it")
+    page.wait_for_selector("#what:text-is('Green body, cannot move')")
+    page.keyboard.press("Delete")
+    page.wait_for_selector("#selected", state="hidden")
+    click(page, 4.0, 0.7)
+    page.wait_for_selector("#what:text-is('Blue body')")
+
+
+def test_delete_key_leaves_scenery_as_it_is(page: Any) -> None:
+    click(page, 2.5, -0.04)
+    page.wait_for_selector("#what:text-is('Plain body, cannot move')")
+    page.keyboard.press("Delete")
+    place(page, "Circle", 1.0, 0.7, "green")  # answers come in the order of requests
+    click(page, 2.5, -0.04)
+    page.wait_for_selector("#what:text-is('Plain body, cannot move')")
+
+
 def test_page_shows_training_to_its_end(page: Any, tmp_path: Path) -> None:
     place(page, "Circle", 1.0, 0.7, "green")
     place(page, "Rectangle", 4.0, 0.7, "blue")
