@@ -74,6 +74,7 @@ class Session:
             "thrusters": thrusters.tolist(),
             "seconds": file.rules.frame_skip * file.rules.physics.dt,
             "steps": file.rules.max_timesteps,
+            "longest": RECORD_STEPS,
             "witness": self._witness is not None,
             "policy": self._contender is not None and self._contender.policy.can_play(file.level.size),
             "undo": bool(self._undo),
@@ -86,14 +87,15 @@ class Session:
         return self._moment()
 
     def step(self, request: Message) -> Message:
-        """Take one env step under `action`."""
+        """Take one env step under `action`; `kept` says that the episode is the witness now."""
         action = _action(request["action"])
         self._now, outcome = _advance(self._file.level, self._now, action[:, None], self._file.rules)
         self._actions.append(action)
         done, goal = bool(outcome.done[0]), bool(outcome.goal[0])
-        if goal and len(self._actions) <= RECORD_STEPS:
+        kept = goal and len(self._actions) <= RECORD_STEPS
+        if kept:
             self._witness = np.stack(self._actions)
-        moment = self._moment() | {"done": done, "goal": goal}
+        moment = self._moment() | {"done": done, "goal": goal, "kept": kept}
         if done:
             self._now, self._actions = task.reset(self._file.level), []
         return moment

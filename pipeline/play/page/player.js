@@ -26,6 +26,7 @@
 
     open(level) {
       this.play(false);
+      this.watching = null; // a film of the level before
       this.level = level;
       this.ended = false;
       this.pads();
@@ -127,8 +128,9 @@
       this.play(false);
       this.ended = true;
       const over = moment.timestep >= this.level.steps ? "Time is up." : "Green touched red.";
-      this.say(moment.goal ? `Solved in ${moment.timestep} steps: save it below.` : over, moment.goal);
-      if (moment.goal) at("watch").disabled = at("save-witness").disabled = false;
+      const what = moment.kept ? ": save it below." : `, but a witness has at most ${this.level.longest}: reach the goal sooner to save it.`;
+      this.say(moment.goal ? `Solved in ${moment.timestep} steps${what}` : over, moment.goal);
+      if (moment.kept) at("watch").disabled = at("save-witness").disabled = false;
     }
 
     async restart() {
@@ -142,7 +144,11 @@
 
     // Play the witness.
     async watch() {
-      this.film(await this.link.ask("play"));
+      try {
+        this.film(await this.link.ask("play"));
+      } catch (error) {
+        levelproof.problem(error.message);
+      }
     }
 
     // Play the policy's next attempt.

@@ -197,3 +197,29 @@ def test_level_whose_steps_take_minutes_is_refused(page: ClientConnection, tmp_p
     with pytest.raises(UserError, match="take 1,000,000 physics steps per env step, and the player at most 8: choose"):
         level_to_play(path, None, None)
     assert "lower its frame_skip" in ask(page, "load", document=document)["error"]
+
+
+def test_success_after_the_end_of_a_record_is_no_witness() -> None:
+    """Rules of a file may let an episode go on for longer than a record."""
+    file = empty_file("m")
+    session = Session(replace(file, rules=replace(file.rules, max_timesteps=1000)))
+    for name, *values in driven_by_a_thruster():
+        assert "error" not in session.answer({"ask": "edit", "name": name, "with": values})
+    for wait, kept in ((RECORD_STEPS, False), (0, True)):
+        session.restart({})
+        for _ in range(wait):
+            assert not session.step({"action": [0] * 6})["done"]
+        moment = {"done": False}
+        while not moment["done"]:
+            moment = session.step({"action": [0, 0, 0, 0, 1, 0]})
+        assert (moment["goal"], moment["kept"]) == (True, kept)
+        assert session.level({})["witness"] == kept
+
+
+def driven_by_a_thruster() -> list[tuple[Any, ...]]:
+    """Edits of an empty level of size m: a green circle whose thruster pushes it to a blue rectangle."""
+    circle, rectangle = 6, 4
+    return [
+        ("add_body", "circle", 1.0, 0.7), ("set_role", circle, 1), ("add_body", "rectangle", 4.0, 0.7),
+        ("set_role", rectangle, 2), ("fix", rectangle, True), ("add_thruster", 1.0, 0.7, 0.0),
+    ]  # fmt: skip

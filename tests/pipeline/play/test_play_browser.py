@@ -10,10 +10,10 @@ import pytest
 from levelproof.levelgen.files.level_file import from_document
 from levelproof.pipeline.look.gallery.attempts import Contender
 from levelproof.pipeline.play.server import HOST, serving
-from levelproof.pipeline.play.session import empty_file
+from levelproof.pipeline.play.session import Session, empty_file
 from tests.pace import patience
 from tests.pipeline.look.test_gallery_browser import UNNAMED, chromium, patient
-from tests.pipeline.play.test_play import QUICK, random_policy
+from tests.pipeline.play.test_play import QUICK, driven_by_a_thruster, random_policy
 
 __all__ = ["chromium"]  # a fixture
 pytestmark = pytest.mark.campaign
@@ -115,6 +115,24 @@ def test_delete_key_leaves_scenery_as_it_is(page: Any) -> None:
     place(page, "Circle", 1.0, 0.7, "green")  # answers come in the order of requests
     click(page, 2.5, -0.04)
     page.wait_for_selector("#what:text-is('Plain body, cannot move')")
+
+
+def test_film_ends_when_another_level_is_opened(page: Any, tmp_path: Path) -> None:
+    session = Session(empty_file("m"))
+    for name, *values in driven_by_a_thruster():
+        session.edit({"name": name, "with": values})
+    while not session.step({"action": [0, 0, 0, 0, 1, 0]})["done"]:
+        pass
+    (tmp_path / "witness.json").write_text(json.dumps(session.save({})["document"]))
+    page.locator("#open").set_input_files(tmp_path / "witness.json")
+    page.wait_for_selector("#pads button")
+    page.select_option("#speed", "0.25")
+    button(page, "Watch")
+    page.wait_for_selector("#clock:has-text('step 2 of')")
+    page.select_option("#new", "s")
+    page.wait_for_function("document.querySelector('#pads').textContent.includes('Nothing acts')")
+    page.wait_for_timeout(500)  # ms, time in which the film could go on
+    assert page.locator("#clock").inner_text().startswith("step 0 of")
 
 
 def test_page_shows_training_to_its_end(page: Any, tmp_path: Path) -> None:
