@@ -163,6 +163,17 @@ def test_level_page_plays_the_record(page: Any, address: str, split: Path) -> No
     assert page.evaluate(UNNAMED) == []
 
 
+def test_typed_limits_are_exact(page: Any, address: str, split: Path) -> None:
+    """Typing one limit leaves the other as it is, and both are shown in full."""
+    page.goto(f"{address}#thrusters=0.12345678..5.87654321")
+    wait_until_drawn(page)
+    lower, upper = (page.get_by_label(f"thrusters, {end}", exact=True) for end in ("at least", "at most"))
+    assert (lower.input_value(), upper.input_value()) == ("0.12345678", "5.87654321")
+    upper.fill("5.5")
+    upper.press("Enter")
+    assert page.url.endswith("#thrusters=0.12345678..5.5")
+
+
 def test_level_page_plays_a_policy_beside_the_witness(page: Any, split: Path, tmp_path: Path) -> None:
     network = NetworkConfig(PolicyKind.INVARIANT, width=8, depth=1)
     params = jax.jit(initial_policy, static_argnums=(1, 2))(jax.random.key(0), network, SIZES["s"])

@@ -82,8 +82,8 @@
         pointerdown: (event) => this.begin(event), pointermove: (event) => this.drag(event), pointerup: () => this.end(),
       }, this.all, this.brush, this.chosen);
       this.clear = create("button", { type: "button", "aria-label": `Clear ${readable(name)}`, click: () => this.choose(null) }, "clear");
-      this.inputs = ["at least", "at most"].map((words) =>
-        create("input", { type: "number", step: "any", "aria-label": `${readable(name)}, ${words}`, change: () => this.typed() }));
+      this.inputs = ["at least", "at most"].map((words, end) =>
+        create("input", { type: "number", step: "any", "aria-label": `${readable(name)}, ${words}`, change: () => this.typed(end) }));
       this.element = create("div", { class: "filter histogram" }, create("h3", {}, readable(name), this.clear), this.drawing,
         create("div", { class: "ends" }, ...this.inputs));
     }
@@ -123,10 +123,12 @@
       return [low + first * width, Math.min(high, whole ? end - 1 : end)];
     }
 
-    typed() {
-      const { low, high } = this.bins;
-      const [from, to] = this.inputs.map((input) => (input.value === "" ? NaN : Number(input.value)));
-      this.choose(Number.isNaN(from) && Number.isNaN(to) ? null : [Number.isNaN(from) ? low : from, Number.isNaN(to) ? high : to]);
+    // Take the limit that was typed, 0 the lower or 1 the upper; the other stays.
+    typed(end) {
+      const all = [this.bins.low, this.bins.high];
+      const range = [...(this.choice.conditions.get(this.name) || all)];
+      range[end] = this.inputs[end].value === "" ? all[end] : Number(this.inputs[end].value);
+      this.choose(this.inputs.every((input) => input.value === "") ? null : range);
     }
 
     choose(range) {
@@ -158,7 +160,7 @@
       this.clear.hidden = !range;
       [low, high].forEach((end, i) => {
         this.inputs[i].placeholder = formatted(end);
-        this.inputs[i].value = range ? Number(range[i].toPrecision(6)) : "";
+        this.inputs[i].value = range ? String(range[i]) : "";
       });
       const total = chosen.reduce((sum, rows) => sum + rows, 0);
       this.drawing.setAttribute("aria-label", `Histogram of ${readable(this.name)}: ${total} levels between ${formatted(low)} and ${formatted(high)}`);
