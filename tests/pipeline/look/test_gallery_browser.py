@@ -174,6 +174,34 @@ def test_typed_limits_are_exact(page: Any, address: str, split: Path) -> None:
     assert page.url.endswith("#thrusters=0.12345678..5.5")
 
 
+def test_keys_work_after_a_button_and_in_capitals(page: Any, address: str, split: Path) -> None:
+    page.goto(f"{address}#level={solved(split)}")
+    page.wait_for_selector("#title:has-text('Level')")
+    steps = int(page.locator("#scrub").get_attribute("max"))
+    page.locator("#step-on").click()
+    page.keyboard.press("End")
+    assert page.locator("#clock").inner_text().startswith(f"step {steps} of {steps} · ")
+    page.keyboard.press("Enter")  # presses the button, which is at the end already
+    page.locator("#trails").click()
+    page.keyboard.press("Home")
+    assert page.locator("#clock").inner_text().startswith("step 0 of ")
+    page.keyboard.press("N")
+    page.wait_for_selector(f"#title:not(:text('Level {solved(split)}'))")
+
+
+def test_one_step_back_leaves_the_last_picture(page: Any, address: str, split: Path) -> None:
+    """Also while the film rests on it."""
+    page.goto(f"{address}#level={solved(split)}")
+    page.wait_for_selector("#title:has-text('Level')")
+    steps = int(page.locator("#scrub").get_attribute("max"))
+    page.keyboard.press("End")
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press(" ")
+    page.wait_for_selector(f"#clock:has-text('step {steps} of')")
+    page.keyboard.press("ArrowLeft")
+    assert page.locator("#clock").inner_text().startswith(f"step {steps - 1} of {steps} · ")
+
+
 def test_level_page_plays_a_policy_beside_the_witness(page: Any, split: Path, tmp_path: Path) -> None:
     network = NetworkConfig(PolicyKind.INVARIANT, width=8, depth=1)
     params = jax.jit(initial_policy, static_argnums=(1, 2))(jax.random.key(0), network, SIZES["s"])

@@ -13,7 +13,7 @@
       Object.assign(this, { columns, worlds, row: null, film: null, policy: null, steps: 0, playing: false });
       this.colours = levelproof.coloursOf();
       at("play").addEventListener("click", () => this.play(!this.playing));
-      at("step-back").addEventListener("click", () => this.seek(Math.ceil(this.time) - 1));
+      at("step-back").addEventListener("click", () => this.back());
       at("step-on").addEventListener("click", () => this.seek(Math.floor(this.time) + 1));
       at("scrub").addEventListener("input", () => this.seek(Number(at("scrub").value)));
       at("trails").addEventListener("change", () => this.draw());
@@ -96,6 +96,11 @@
       this.draw();
     }
 
+    // One step back; the rest after the last picture counts as the last picture.
+    back() {
+      this.seek(Math.ceil(Math.min(this.time, this.steps)) - 1);
+    }
+
     play(playing) {
       this.playing = playing && this.steps > 0;
       at("play").textContent = this.playing ? "Pause" : "Play";
@@ -163,10 +168,10 @@
 
     key(event) {
       if (this.row === null || event.ctrlKey || event.metaKey || event.altKey) return;
-      if (/^(INPUT|SELECT|BUTTON|A)$/.test(event.target.tagName) && event.key !== "Escape") return;
+      if (usesKey(event.target, event.key)) return;
       const deeds = {
         " ": () => this.play(!this.playing),
-        ArrowLeft: () => this.seek(Math.ceil(this.time) - 1),
+        ArrowLeft: () => this.back(),
         ArrowRight: () => this.seek(Math.floor(this.time) + 1),
         Home: () => this.seek(0),
         End: () => this.seek(this.steps),
@@ -174,10 +179,17 @@
         n: () => at("next").click(),
         p: () => at("previous").click(),
       };
-      if (!deeds[event.key]) return;
+      const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+      if (!deeds[key]) return;
       event.preventDefault();
-      deeds[event.key]();
+      deeds[key]();
     }
+  }
+
+  // Whether the focused element has a use of its own for a key: buttons are pressed, words are typed.
+  function usesKey({ tagName, type }, key) {
+    if (tagName === "SELECT" || (tagName === "INPUT" && !/^(checkbox|range)$/.test(type))) return key !== "Escape";
+    return /^(BUTTON|A|INPUT)$/.test(tagName) && (key === " " || key === "Enter");
   }
 
   // Decode an episode, of a witness or a policy; null if there is none.
