@@ -160,6 +160,7 @@ def _about(manifest: Manifest, matching: int, where: str | None, columns: list[d
     rules = rules_of(manifest)
     return {
         "split": as_typed(manifest.split),
+        "quoted": shlex.quote(as_typed(manifest.split)),
         "levels": manifest.table.num_rows,
         "found": matching,
         "where": where,

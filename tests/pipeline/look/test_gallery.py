@@ -1,6 +1,8 @@
 """Gallery files agree with the split: rows, worlds and states."""
 
 import json
+import shlex
+import shutil
 from base64 import b64decode
 from pathlib import Path
 from typing import Any
@@ -68,6 +70,13 @@ def test_gallery_columns_equal_the_manifests(site: Path, manifest: Manifest) -> 
         assert found == [kind_of_reason(x) if name == "label_reason" else x for x in table[name].to_pylist()]
     for name, counts in count_entities(levels_of(manifest, table)).items():
         np.testing.assert_array_equal(numbers(page[name], "<f4"), counts)
+
+
+def test_commands_of_the_pages_quote_the_split_for_a_shell(split: Path, tmp_path: Path) -> None:
+    spaced = Path(shutil.copytree(split, tmp_path / "my $levels"))
+    gallery(spaced, tmp_path / "site", None, 1)
+    about = data(tmp_path / "site", "about")
+    assert shlex.split(about["quoted"]) == [str(spaced)] == [about["split"]]
 
 
 def test_level_file_has_its_row_and_witness_states(site: Path, manifest: Manifest) -> None:

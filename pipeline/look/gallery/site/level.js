@@ -50,7 +50,7 @@
       const reason = row.label_reason;
       at("reason").textContent = `${reason[0].toUpperCase()}${reason.slice(1)}.`;
       at("command").textContent = row.command;
-      at("hands").textContent = `levelproof play ${this.columns.about.split} ${row.level_id}`;
+      at("hands").textContent = `levelproof play ${this.columns.about.quoted} ${row.level_id}`;
       at("controls").hidden = !this.steps;
       at("scrub").max = this.steps;
       this.keys = liveEntries(this.world).map((entry) => {
