@@ -174,6 +174,13 @@ def test_typed_limits_are_exact(page: Any, address: str, split: Path) -> None:
     assert page.url.endswith("#thrusters=0.12345678..5.5")
 
 
+def test_address_that_is_cut_off_shows_what_is_left(page: Any, address: str, split: Path) -> None:
+    page.goto(f"{address}#label=%,solved&label_reason=%E2%8")
+    wait_until_drawn(page)
+    count = sum(row["label"] == "solved" for row in rows(split))
+    assert page.locator("#count").inner_text() == f"{count} of {PLAYED} levels"
+
+
 def test_keys_work_after_a_button_and_in_capitals(page: Any, address: str, split: Path) -> None:
     page.goto(f"{address}#level={solved(split)}")
     page.wait_for_selector("#title:has-text('Level')")

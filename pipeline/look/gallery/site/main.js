@@ -27,6 +27,15 @@
     return `#${parts.join("&")}`;
   }
 
+  // Decode a word of an address; "" if it is cut off, as in a shortened link.
+  function decoded(word) {
+    try {
+      return decodeURIComponent(word);
+    } catch {
+      return "";
+    }
+  }
+
   // Decode an address into conditions and an order; ignore unknown words and columns.
   function choose(address) {
     choice.clear();
@@ -36,7 +45,7 @@
       if (name === "sort" && columns.values[value.replace("-", "")]) choice.sort(value.replace("-", ""), value[0] === "-" ? -1 : 1);
       const words = wordsOf(name);
       if (words) {
-        const indices = value.split(",").map((word) => words.indexOf(decodeURIComponent(word))).filter((index) => index >= 0);
+        const indices = value.split(",").map((word) => words.indexOf(decoded(word))).filter((index) => index >= 0);
         if (indices.length) choice.set(name, new Set(indices));
       } else if (columns.values[name]) {
         const [low, high] = value.split("..").map(Number);
