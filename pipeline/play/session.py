@@ -61,15 +61,16 @@ class Session:
     def level(self, _: Message) -> Message:
         """Describe the initial world, and what can be edited in it."""
         one, file = one_of(self._file.level), self._file
-        bodies, _still = drawn_bodies(one)
-        joints, thrusters = np.flatnonzero(one.model.joint_active), np.flatnonzero(one.model.thruster_active)
+        (bodies, _still), model = drawn_bodies(one), one.model
+        joints = np.flatnonzero(model.joint_active & model.active[model.joint_a])  # as `site/draw.js` draws them
+        thrusters = np.flatnonzero(model.thruster_active & model.active[model.thruster_body])
         return {
             "world": world_of(one),
             "size": name_of(file.level.size),
             "sizes": list(SIZES),
             "roles": [role.name.lower() for role in Role],
             "bodies": bodies.tolist(),
-            "fixed": (one.model.inverse_mass[bodies] == 0).tolist(),
+            "fixed": (model.inverse_mass[bodies] == 0).tolist(),
             "joints": joints.tolist(),
             "thrusters": thrusters.tolist(),
             "seconds": file.rules.frame_skip * file.rules.physics.dt,

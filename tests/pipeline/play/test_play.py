@@ -216,6 +216,20 @@ def test_success_after_the_end_of_a_record_is_no_witness() -> None:
         assert session.level({})["witness"] == kept
 
 
+def test_what_is_attached_to_a_missing_body_is_not_listed() -> None:
+    """The page does not draw it, and would give its place to what comes next."""
+    session = Session(empty_file("m"))
+    edits = [("add_body", "circle", x, 0.7) for x in (1.0, 1.2, 3.0)]
+    for name, *values in (*edits, ("add_joint", 1.1, 0.7, False), *(("add_thruster", x, 0.7, 0.0) for x in (1.1, 3.0))):
+        assert "error" not in session.answer({"ask": "edit", "name": name, "with": values}), name
+    level = session.file.level
+    assert [*session.level({})["joints"], *session.level({})["thrusters"]] == [0, 0, 1]
+    active = level.model.active.copy()
+    active[[level.model.joint_a[0, 0], level.model.thruster_body[0, 0]]] = False
+    shown = Session(replace(session.file, level=replace(level, model=replace(level.model, active=active)))).level({})
+    assert (shown["joints"], shown["thrusters"]) == ([], [1])
+
+
 def driven_by_a_thruster() -> list[tuple[Any, ...]]:
     """Edits of an empty level of size m: a green circle whose thruster pushes it to a blue rectangle."""
     circle, rectangle = 6, 4
