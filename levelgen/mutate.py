@@ -5,6 +5,7 @@ does not allow is redrawn; `playable` marks the children that can be played. Num
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -46,7 +47,8 @@ from levelproof.physics.types import FIXED_POLYGONS
 MAX_TRIES = 20  # attempts to draw an edit that the level allows
 STEP = 0.5  # m, standard deviation of a move along either axis
 MAX_FACTOR = 1.5  # by which an edit enlarges or shrinks a body
-MAX_SPEED = 3.0  # m/s after one env step; 99% of sampled levels have no faster body
+FIRST_STEPS = 2  # physics steps, at most, after which a level must be calm
+MAX_SPEED = 3.0  # m/s after these; 99% of sampled levels have no faster body
 
 Draw = Callable[[Level, np.random.Generator], Level]  # an edit with random arguments
 
@@ -86,11 +88,12 @@ def _edited(level: Level, rng: np.random.Generator) -> Level:
 @jax.jit(static_argnames="rules")
 def playable(level: Level, rules: TaskParams) -> Bool[Array, " lane"]:
     """Find levels with a green, a blue and a driven body, and the centres of all bodies in the room, that begin calmly:
-    one idle env step neither ends the episode nor leaves a body faster than MAX_SPEED.
+    FIRST_STEPS without actuators neither end the episode nor leave a body faster than MAX_SPEED.
 
     The speed limit excludes most overlaps, since the engine flings overlapping bodies apart.
     """
     model, role = level.model, jnp.where(level.model.active, level.role, Role.PLAIN)
+    rules = replace(rules, frame_skip=min(rules.frame_skip, FIRST_STEPS))
     after, result = advance(level, reset(level), jnp.zeros((ACTIONS, role.shape[-1]), jnp.int32), rules)
     place = level.state.position[FIXED_POLYGONS:]
     inside = ((place >= 0) & (place <= WORLD_SIDE)).all(1) | ~model.active[FIXED_POLYGONS:]

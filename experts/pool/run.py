@@ -152,14 +152,17 @@ class TrainingRun:
         trained = submission.trained(self.pool.config) if len(submission.level_ids) else as_found(submission.found)
         attempted = self._attempted(trained)
         with lap() as took:
-            result = self._judged(submission, trained, attempted)
+            result, reworking = self._judged(submission, trained, attempted)
         searched = np.zeros(len(self.level_ids), np.int64)
         searched[self.left] = submission.found.search_steps
+        searched[np.isin(self.level_ids, list(self._paused))] = 0  # an earlier process searched these
         self.ledger.share("search", searched)
+        for level, seconds in reworking.items():
+            self.ledger.put("search", level, seconds)
         if len(submission.level_ids):
             self.ledger.take(submission.ledger, self.left)
         ledger = self.ledger.only(np.flatnonzero(np.isin(self.level_ids, result.level_ids)))
-        ledger.add("replay", took)
+        ledger.add("replay", Lap(max(0.0, took.seconds - sum(reworking.values())), took.compiling))
         return replace(result, ledger=ledger)
 
     def _attempted(self, trained: Sequence[TrainedLevel]) -> dict[int, tuple[float, int]]:
@@ -179,7 +182,8 @@ class TrainingRun:
 
     def _judged(
         self, submission: TrainingJob, trained: list[TrainedLevel], attempted: Mapping[int, tuple[float, int]]
-    ) -> UnitResult:
+    ) -> tuple[UnitResult, dict[int, float]]:
+        """Return the results, and the seconds of rework by index into `level_ids`, in proportion to env steps."""
         config, rules = self.pool.config, self.pool.rules
         kept = np.flatnonzero(~np.isin(self.level_ids, list(self._left_out)))
         levels, level_ids = self._some(kept)
@@ -193,7 +197,9 @@ class TrainingRun:
         for i, level in zip(left, trained, strict=True):
             candidates[i] = level.candidates
         chosen = choose(levels, level_ids, candidates, config.replays, rules)
-        chosen, reworked = rework(levels, level_ids, chosen, self.pool.procedure, rules)
+        with lap() as took:
+            chosen, reworked = rework(levels, level_ids, chosen, self.pool.procedure, rules)
+        reworking = {int(kept[i]): took.seconds * reworked[i] / reworked.sum() for i in np.flatnonzero(reworked)}
         for i, witness in enumerate(chosen):
             if witness is not None:
                 actions[..., i] = witness.action
@@ -213,7 +219,8 @@ class TrainingRun:
         record = jax.tree.map(lambda x: np.where(witnessed, x, np.zeros_like(x)), record)
         ended = zip(level_ids[left].tolist(), trained, strict=True)
         experts = {level_id: level.expert for level_id, level in ended if level.expert is not None}
-        return UnitResult(level_ids, levels, record, known, spent_on(known, submission, config), experts)
+        result = UnitResult(level_ids, levels, record, known, spent_on(known, submission, config), experts)
+        return result, reworking
 
     def _some(self, indices: Int[np.ndarray, " index"]) -> tuple[Level, Int[np.ndarray, " index"]]:
         return take(self.levels, indices), self.level_ids[indices]

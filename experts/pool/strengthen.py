@@ -59,6 +59,8 @@ def strengthen(
         new = edits(variation, now.code, now.length, draw(Draws.STRENGTHEN, level_ids, now.number, 10, LANES), ring)
         new = new.at[:, 0].set(now.code)
         steps, _ = replayed(ring, new, jnp.where(active, now.length, 0), rules, KEPT)
+        # The witness is known to reach the goal, but is not played to its end if KEPT variations are shorter
+        steps = steps.at[:, 0].set(jnp.where(active, now.length, RECORD_STEPS + 1))
         kept = jnp.argsort(jnp.where(lane, steps * LANES + lane, 0), axis=-1)[:, :KEPT]
         new, steps = jnp.take_along_axis(new, kept[..., None], 1), jnp.take_along_axis(steps, kept, 1)
         reached = steps <= RECORD_STEPS

@@ -6,11 +6,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from levelproof.experts.config import MAX_COUNTED
+from levelproof.experts.config import MAX_COUNTED, RECORD_STEPS
 from levelproof.physics.bounds import require
 
 MAX_ROUNDS = 1024  # limit of `trials` and `robustness`
 MAX_RUNGS = 16  # each rung is four times the one before, and env steps are counted in 32 bits
+NEAREST = 8  # trajectories of a level that are varied; the first ones come from its archive
 MAX_ENTRIES = 16_384  # sums of their weights (`experts.search.archive`) must fit 32 bits
 
 
@@ -69,7 +70,7 @@ class SearchConfig:
         require(self, ("robustness",), 0, MAX_ROUNDS)
         require(self, ("trials",), 1, MAX_ROUNDS)
         require(self, ("lanes", "segment", "segments", "rounds", "first_rung"), 1)
-        require(self, ("entries",), 1, MAX_ENTRIES)
+        require(self, ("entries",), NEAREST, MAX_ENTRIES)
         require(self, ("nearer", "new_action"), 0, 1)
         require(self, ("width",), 0, above=True)
         require(self, ("growth",), 1, above=True)
@@ -84,6 +85,10 @@ class SearchConfig:
             raise ValueError(
                 f"lanes is {self.lanes}: a round of lanes x segments x segment env steps is too long: lower one of them"
             )
+        if self.lanes * self.trials * RECORD_STEPS > MAX_COUNTED // 4:
+            raise ValueError(
+                f"trials is {self.trials}: with {self.lanes} lanes these are too many env steps: lower one of them"
+            )
 
     def scaled(self, bodies: int) -> "SearchConfig":
         """Scale env steps to a world of this many bodies, so that it takes about as long as a small one.
@@ -91,7 +96,8 @@ class SearchConfig:
         An env step costs about the square of the number of bodies.
         """
         share = min(1.0, (self.bodies / bodies) ** 2) if self.bodies else 1.0
-        reduced = {name: int(getattr(self, name) * share) for name in ("env_steps", "variations", "patience")}
+        at_least_1 = lambda number: number and max(1, int(number * share))  # 0 means none, or no limit
+        reduced = {name: at_least_1(getattr(self, name)) for name in ("env_steps", "variations", "patience")}
         return replace(self, **reduced)
 
     @property

@@ -4,7 +4,7 @@ Episodes end, and reach the goal, exactly as in `levelgen.task.rules.advance`.
 """
 
 import math
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from levelproof.physics.step import step
 from levelproof.physics.types import State
 
 CODES = math.prod(CHOICES)  # number of actions
+UNROLLED = 8  # physics steps of an env step up to which the program repeats them instead of looping
 T = TypeVar("T")
 
 
@@ -111,12 +112,21 @@ def act(arena: Arena, walk: Walk, action: Int[Array, "6 lane"], rules: TaskParam
     """Advance all lanes by one env step."""
     state, reached, ended, timestep = walk.state, walk.reached, walk.ended, walk.timestep + 1
     driven = controls(arena.lanes, action)
-    for _ in range(rules.frame_skip):
+
+    def frame(_: Any, now: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
+        state, reached, ended = now
         state = step(arena.lanes.model, state, *driven, rules.physics, with_contacts=False)[0]
         fail = (arena.red & state.contact_active).any(0)
         goal = (arena.blue & state.contact_active).any(0) & ~fail
-        reached = jnp.where(goal & ~ended, timestep, reached)
-        ended = ended | fail | goal
+        return state, jnp.where(goal & ~ended, timestep, reached), ended | fail | goal
+
+    now = state, reached, ended
+    if rules.frame_skip <= UNROLLED:
+        for i in range(rules.frame_skip):
+            now = frame(i, now)
+    else:
+        now = jax.lax.fori_loop(0, rules.frame_skip, frame, now)
+    state, reached, ended = now
     ended = ended | (timestep >= most_steps(rules)) | has_nan(state)
     return Walk(state, action, timestep, reached, ended)
 

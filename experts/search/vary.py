@@ -1,6 +1,7 @@
 """Variations: evolution of whole trajectories until one reaches the goal.
 
-Each level keeps the few trajectories that brought green and blue nearest to each other. A lane plays a variation of
+Each level keeps the few trajectories that brought green and blue nearest to each other, at first those to the nearest
+states in its archive. A lane plays a variation of
 one of them from the level's start: stretches are resampled or shifted in time. If the variation came nearer than a kept
 trajectory, it replaces it; then the lane plays another. Go-Explore resamples all actions after the state it returns to;
 a variation keeps the actions after a change, so it can correct an aim.
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, UInt16, UInt32
 
 from levelproof.experts.search.archive import Archive
-from levelproof.experts.search.config import SearchConfig, StopLimits
+from levelproof.experts.search.config import NEAREST, SearchConfig, StopLimits
 from levelproof.experts.search.edit import Draws, Edit, below, draw, edited, some_of, stretch
 from levelproof.experts.search.explore import NEARER, patient, with_success
 from levelproof.experts.search.near import FAR, gap
@@ -24,7 +25,6 @@ from levelproof.levelgen.level import ACTIONS, Level
 from levelproof.levelgen.programs import jit_quickly, jit_stored
 from levelproof.levelgen.task.rules import TaskParams
 
-KEPT = 8  # trajectories per level
 BEYOND = 16  # env steps played beyond the step at which the varied trajectory was nearest
 CHANGES = 2  # maximum number of changes in a variation
 LESS_PATIENT = 4  # divides the patience of Go-Explore: variations succeed sooner (docs/tried/cells.md)
@@ -159,12 +159,12 @@ def together(one: Array, other: Array) -> Array:
 
 
 def first_of(some: Approaches) -> Approaches:
-    """Return the KEPT nearest trajectories; of several with the same gap only the first, if enough others exist."""
+    """Return the NEAREST nearest trajectories; of several with the same gap only the first, if enough others exist."""
     order = jnp.argsort(some.gap, axis=-1)
     gaps = jnp.take_along_axis(some.gap, order, axis=-1)
     again = jnp.pad(gaps[:, 1:] == gaps[:, :-1], [(0, 0), (1, 0)])
     gaps = jnp.where(again, FAR, gaps)
-    first = jnp.argsort(gaps, axis=-1)[:, :KEPT]
+    first = jnp.argsort(gaps, axis=-1)[:, :NEAREST]
     pick = lambda x, order: jax.vmap(lambda x, order: x[order])(x, order)
     kept = jax.tree.map(lambda x: pick(x, pick(order, first)), some)
     return kept._replace(gap=pick(gaps, first))

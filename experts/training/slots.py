@@ -147,7 +147,7 @@ def slots_of(
     """
     count, rows = len(level_ids), config.record_rollouts * config.horizon
     due, final, deadline = map(jnp.asarray, pending)
-    final |= experts.training.course.over != Cause.NONE
+    final |= (experts.training.course.over != Cause.NONE) | (experts.training.course.updates >= deadline)
     mode = jnp.where(due | final, jnp.int32(Mode.EVALUATE), jnp.int32(Mode.TRAIN))
     action = jnp.zeros((count, rows, len(CHOICES), config.attempts), jnp.int8)
     done, goal = jnp.zeros((2, count, rows, config.environments), bool)

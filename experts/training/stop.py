@@ -40,7 +40,7 @@ def rules_of(stopping: StopConfig, config: ExpertConfig) -> StopRules:
         robustness=np.int32(config.updates_in(stopping.robustness) if stopping.robustness else 0),
         first_rung=np.int32(config.updates_in(stopping.first_rung)),
         gain=np.float32(stopping.gain),
-        fruitless=np.int32(config.updates_in(stopping.fruitless) if stopping.fruitless else LAST),
+        fruitless=np.int32(min(config.updates_in(stopping.fruitless), LAST) if stopping.fruitless else LAST),
     )
 
 

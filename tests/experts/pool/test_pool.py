@@ -68,6 +68,23 @@ def test_submissions_give_the_results_that_each_gives_alone(levels: Level, alone
         assert submission.trained_rollouts == curves
 
 
+def test_an_expert_that_has_used_the_budgets_updates_trains_no_further(levels: Level) -> None:
+    """A larger budget may have room for no further update."""
+    some, ids = part(levels, range(12))
+    pool = new_pool()
+    (first,) = finished(pool, pool.submit(some, ids, keep=True))
+    before = first.trained(CONFIG)
+    spent = [i for i, one in enumerate(before) if len(one.curve) == UPDATES and not one.candidates]
+    begun = {row: expert for row, i in enumerate(spent) if (expert := before[i].expert)}
+    assert len(begun) == len(spent) > 0
+    pool = new_pool()
+    (second,) = finished(pool, pool.submit(take(some, np.array(spent)), ids[spent], begun=begun))
+    assert second.trained_rollouts == 0
+    for i, after in zip(spent, second.trained(CONFIG), strict=True):
+        assert after.curve == before[i].curve
+        assert not after.candidates
+
+
 def test_later_levels_enter_empty_slots(levels: Level) -> None:
     """One level occupies one slot; later levels enter the other."""
     pool = new_pool()

@@ -11,6 +11,7 @@ import pytest
 from benchmarks.alone import label
 from levelproof.experts.config import ExpertConfig, Rule, StopConfig
 from levelproof.experts.labels import Label, Source
+from levelproof.experts.pool.strengthen import strengthen
 from levelproof.experts.procedure import Procedure
 from levelproof.experts.search.config import SearchConfig
 from levelproof.experts.search.explore import NEARER, Search, begin, draw, explore, explore_rounds, under_way
@@ -265,6 +266,7 @@ def test_scaled_gives_larger_worlds_fewer_env_steps() -> None:
         == limits(replace(given, bodies=0).scaled(16))
     )
     assert limits(given.scaled(16)) == (25_000, 5000, 1000)
+    assert limits(replace(given, patience=3, variations=0).scaled(64)) == (1562, 0, 1), "0 would mean no limit"
     four = replace(CONFIG, bodies=4, env_steps=207_360, patience=0, per_cell=0)
     at = np.flatnonzero(KINDS == BROKEN)[:1]
     assert search(take(levels(), at), IDS[:1], four, DEFAULT_RULES).env_steps == 40_960  # of 9 bodies
@@ -316,15 +318,31 @@ def test_insert_omits_states_that_break_later() -> None:
     assert np.isfinite(archive.entry.feature[archive.used]).all()
 
 
+def delayed(at: np.ndarray) -> Success:
+    """Return the successes of these levels; the first begins with 20 env steps in which the ball lies on the floor."""
+    known = jax.tree.map(lambda x: x[at], found().success)
+    given = Success(known.action.copy(), known.length.copy())
+    given.action[0, :20] = 0
+    given.action[0, 20:] = known.action[0, :-20]
+    given.length[0] += 20
+    return given
+
+
+@pytest.mark.slow
+def test_strengthening_keeps_a_witness_that_survives_all_replays() -> None:
+    """It is compared with its variations even if many of these are shorter."""
+    at = SOLVABLE[:1]
+    given = delayed(at)
+    stronger = strengthen(take(levels(), at), IDS[at], given, 2, DEFAULT_RULES)
+    assert stronger.success.length[0] == given.length[0]
+    np.testing.assert_array_equal(np.asarray(stronger.success.action)[0], given.action[0])
+
+
 def test_shorten_removes_detours() -> None:
     """A success after idle steps becomes shorter, a failing one is dropped, none becomes longer."""
     width = side_by_side(CONFIG)
     at = np.resize(SOLVABLE, width)
-    known = jax.tree.map(lambda x: x[at], found().success)
-    given = Success(known.action.copy(), known.length.copy())
-    given.action[0, :20] = 0  # the ball lies on the floor, and waits
-    given.action[0, 20:] = known.action[0, :-20]
-    given.length[0] += 20
+    given = delayed(at)
     given.action[1] = 0
     shorter = shorten(take(levels(), at), IDS[at], given, CONFIG, DEFAULT_RULES)
     length = np.asarray(shorter.success.length)
@@ -340,11 +358,12 @@ def test_shorten_removes_detours() -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"lanes": 30}, {"entries": 0}, {"growth": 1.0}, {"width": 0.0}, {"nearer": 1.5}, {"new_action": -0.5},
-     {"resample": (0.5, 2.0)}, {"resample": ()}, {"entries": 16_385}, {"env_steps": 2**31}, {"driven_weight": -1.0},
-     {"first_rung": 0}, {"per_cell": -1}, {"bodies": -1}, {"trials": 2000}, {"robustness": 2000}, {"width": 1e-46},
-     {"growth": 1.00000001}, {"lanes": 2**28}, {"patience": -1}, {"variations": 2**31},
-     {"polish": -1}, {"polish": 2**31}, {"robustness": -1}, {"patience_gap": -0.1}],
+    [{"lanes": 30}, {"entries": 0}, {"entries": 7}, {"growth": 1.0}, {"width": 0.0}, {"nearer": 1.5},
+     {"new_action": -0.5}, {"resample": (0.5, 2.0)}, {"resample": ()}, {"entries": 16_385}, {"env_steps": 2**31},
+     {"driven_weight": -1.0}, {"first_rung": 0}, {"per_cell": -1}, {"bodies": -1}, {"trials": 2000},
+     {"trials": 1024, "lanes": 16_384}, {"robustness": 2000}, {"width": 1e-46}, {"growth": 1.00000001},
+     {"lanes": 2**28}, {"patience": -1}, {"variations": 2**31}, {"polish": -1}, {"polish": 2**31},
+     {"robustness": -1}, {"patience_gap": -0.1}],
 )  # fmt: skip
 def test_search_config_rejects_invalid_settings(wrong: dict) -> None:
     with pytest.raises(ValueError, match=f"^{next(iter(wrong))} is"):
