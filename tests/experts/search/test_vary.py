@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from levelproof.experts.search.config import SearchConfig
+from levelproof.experts.search.config import NEAREST, SearchConfig
 from levelproof.experts.search.edit import Draws, draw, edited
 from levelproof.experts.search.explore import NEARER
 from levelproof.experts.search.near import FAR, gap
@@ -16,7 +16,6 @@ from levelproof.experts.search.play import act, arena, decode, encode, fresh_wal
 from levelproof.experts.search.search import Searching, side_by_side
 from levelproof.experts.search.vary import (
     CHANGES,
-    KEPT,
     Approaches,
     Varying,
     begin,
@@ -49,8 +48,8 @@ def misses() -> Approaches:
     """Return trajectories of each level: shots into the wall."""
     action = np.zeros((ACTIONS, 256), int)
     action[MOTOR_BINDINGS, :8] = 1
-    code = np.broadcast_to(encode(jnp.array(action)), (WIDTH, KEPT, 256)).copy()
-    steps = np.full((WIDTH, KEPT), 48, np.int32)
+    code = np.broadcast_to(encode(jnp.array(action)), (WIDTH, NEAREST, 256)).copy()
+    steps = np.full((WIDTH, NEAREST), 48, np.int32)
     return Approaches(code, np.full(steps.shape, FAR, np.float32), steps)  # pyright: ignore
 
 
@@ -103,8 +102,8 @@ def test_nearest_trajectories_replay_to_their_gaps() -> None:
     nearest = jax.device_get(now.nearest)
     assert (np.diff(nearest.gap) >= 0).all()
     assert (np.diff(nearest.gap)[nearest.gap[:, 1:] < FAR] > 0).all()
-    ring = arena(levels(), KEPT, (1.0,))
-    by_lane = jnp.array(nearest.code.reshape(WIDTH * KEPT, -1))
+    ring = arena(levels(), NEAREST, (1.0,))
+    by_lane = jnp.array(nearest.code.reshape(WIDTH * NEAREST, -1))
 
     @jax.jit
     def gaps() -> jax.Array:
@@ -114,7 +113,7 @@ def test_nearest_trajectories_replay_to_their_gaps() -> None:
 
         return jax.lax.scan(one, fresh_walk(ring.lanes), by_lane.T)[1]
 
-    all_gaps, steps = np.asarray(gaps()).reshape(256, WIDTH, KEPT), nearest.steps
+    all_gaps, steps = np.asarray(gaps()).reshape(256, WIDTH, NEAREST), nearest.steps
     for level, kept in np.argwhere(nearest.gap < FAR):
         until = all_gaps[: steps[level, kept], level, kept]
         np.testing.assert_allclose(until[-1], nearest.gap[level, kept], rtol=1e-5)  # another program rounds differently
@@ -214,9 +213,9 @@ def test_variation_has_at_least_one_change() -> None:
 
 def test_first_of_keeps_the_nearest_trajectories() -> None:
     """Among trajectories with the same gap, the first stays; the others stay only if there is room."""
-    gaps = np.array([[0.5, 0.25, 0.5, 0.25, 1.0] + [0.5] * (KEPT - 1)], np.float32)
+    gaps = np.array([[0.5, 0.25, 0.5, 0.25, 1.0] + [0.5] * (NEAREST - 1)], np.float32)
     count = gaps.shape[1]
     some = Approaches(np.zeros((1, count, 8), np.uint16), gaps, np.arange(count)[None])  # pyright: ignore
     kept = first_of(some)
     np.testing.assert_array_equal(kept.steps[0, :3], [1, 0, 4])
-    assert kept.gap.shape == (1, KEPT)
+    assert kept.gap.shape == (1, NEAREST)

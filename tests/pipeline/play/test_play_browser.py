@@ -131,7 +131,7 @@ def test_film_ends_when_another_level_is_opened(page: Any, tmp_path: Path) -> No
     page.wait_for_selector("#clock:has-text('step 2 of')")
     page.select_option("#new", "s")
     page.wait_for_function("document.querySelector('#pads').textContent.includes('Nothing acts')")
-    page.wait_for_timeout(500)  # ms, time in which the film could go on
+    page.wait_for_timeout(1000 * patience(0.5))  # ms, in which the film could go on
     assert page.locator("#clock").inner_text().startswith("step 0 of")
 
 
