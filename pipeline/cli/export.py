@@ -36,7 +36,7 @@ def _parquet(split: Path, where: str | None, out: Path) -> None:
 
 
 def _seed(split: Path, where: str | None, out: Path, levels: str | None = None, with_levels: bool = True) -> None:
-    if levels:
+    if levels is not None:
         if where or not with_levels:
             raise UserError("--levels adds the levels to a whole seed file: leave out --where and --without-levels.")
         from levelproof.pipeline.exchange.levels_elsewhere import add_levels
@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> None:
     split, level_id, where, out = arguments.split, arguments.level_id, arguments.where, arguments.out
     if arguments.actions and arguments.format != "minari":
         raise UserError(f"--actions is for --format minari: leave it out for {arguments.format}.")
-    if (arguments.levels or arguments.without_levels) and arguments.format != "seed":
+    if (arguments.levels is not None or arguments.without_levels) and arguments.format != "seed":
         raise UserError("--levels and --without-levels are for --format seed: leave them out, or set it.")
     if arguments.format == JSON:
         if level_id is None or where is not None:

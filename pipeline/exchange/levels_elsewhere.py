@@ -50,8 +50,8 @@ def add_levels(seed: Path, folder: Path, out: Path) -> None:
         out: the new file.
 
     Raises:
-        UserError: `seed` is not one seed file, its levels come from their ids, or the folder lacks one of
-            them, or `out` exists or is not named as seed files are.
+        UserError: `seed` is not one seed file, has its levels, or samples them from their ids; the folder lacks one of
+            them; or `out` exists or is not named as seed files are.
         Failure: the seed file is damaged, the levels are not those that it was written from, or a witness does not
             solve its level.
     """
@@ -62,6 +62,8 @@ def add_levels(seed: Path, folder: Path, out: Path) -> None:
     about, table = read_seed(paths[0], SCHEMA.names)
     if not from_files(about.fragment.config):
         raise UserError(f"The levels of {as_typed(seed)} are sampled from their ids: leave out --levels.")
+    if not table["content"].null_count:
+        raise UserError(f"{as_typed(seed)} has its levels: leave out --levels.")
     prepare_jax()
     found = _levels_below(folder, str(about.fragment.config["size"]))
     lacking = [row for row in table.select(["level_id", "file"]).to_pylist() if row["level_id"] not in found]

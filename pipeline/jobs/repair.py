@@ -115,7 +115,7 @@ def _require_as_examined(split: Path, findings: Findings) -> None:
 def _require_generated(split: Path, findings: Findings) -> None:
     """Raise UserError for a split that no job generated: its actions are elsewhere, and cannot be regenerated."""
     if is_seed(split):
-        raise UserError(f"Seed files such as {split} are not repaired: copy it again from its source.")
+        raise UserError(f"{split} is a seed file, which is not repaired: copy it again from its source.")
     if is_grown(findings.config or {}):
         raise UserError(
             f"The split {split} was grown from seed files, so it is not repaired: delete it and run `levelproof grow` "

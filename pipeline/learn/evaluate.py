@@ -215,6 +215,9 @@ def _measured(
     chosen = {ALL: np.ones(len(group.level_ids), bool), NOT_TRIVIAL: ~solved[NOTHING][:, 0]}
     if group.solved is not None:
         chosen[SOLVED] = group.solved
+    sealed = np.isin(group.level_ids, SEALED_IDS)
+    if not sealed.all():
+        chosen[SEALED] = sealed
     chosen = {title: some for title, some in chosen.items() if some.any()}
     apart = {}
     if len(compared) == 2:

@@ -30,7 +30,7 @@ def log_look(looks: Path, player: str, groups: Sequence[Mapping[str, Any]], atte
     rates = {
         group["levels"]: {"levels": sampled["levels"], "solved": sampled["once"]["rate"]}
         for group in groups
-        for sampled in [group["of"]["all"][player]]
+        for sampled in [group["of"].get("sealed", group["of"]["all"])[player]]  # of a split, only those that are sealed
     }
     look = {"at": datetime.now(UTC).isoformat(timespec="seconds"), "attempts": attempts, "seed": seed, "on": rates}
     before = b""

@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from levelproof.configs.convert import flat
-from levelproof.configs.schema import REPEATED
+from levelproof.configs.schema import is_grown
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.store import files
@@ -179,7 +179,7 @@ class Manifest:
     @property
     def repeats(self) -> bool:
         """Whether records repeat their first episode, without costs: in seeds, and in splits grown from them."""
-        return REPEATED.items() <= (self.config or {}).items()
+        return is_grown(self.config or {})
 
     @property
     def transitions(self) -> int:

@@ -20,6 +20,7 @@ from levelproof.configs.schema import MAX_FRAME_SKIP
 from levelproof.levelgen.level import name_of
 from levelproof.physics.types import Size
 from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.bounds import DataUnread
 from levelproof.pipeline.store.chunks import Chunks, read_whole
 from levelproof.pipeline.store.contents import (
     FULL,
@@ -125,7 +126,7 @@ class Shard:
             attributes = about["attributes"]
             version = attributes.get("version")
             if attributes.get("format") != FORMAT or version != SHARD_VERSION:
-                raise Failure(
+                raise DataUnread(
                     f"The shard {path} has version {str(version)[:20]}, but this program reads {SHARD_VERSION}: "
                     "use the levelproof that wrote it."
                 )

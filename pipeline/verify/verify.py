@@ -226,8 +226,8 @@ def _check_fragments(parts: Sequence[Part], recipe: Recipe, findings: Findings, 
     rows = pa.concat_tables([rows for _, rows in parts])
     digests = {name: files for fragment, _ in parts for name, files in fragment.digests.items()}
     in_shards, in_experts = _levels_by_name(rows, "shard"), _levels_by_name(rows, "experts")
-    shards = {name: _opened(name, recipe, ids, findings) for name, ids in in_shards.items()}
     changed = {name: _changed_files(recipe.split, name, digests.get(name, {})) for name in [*in_shards, *in_experts]}
+    shards = {name: _opened(name, recipe, ids, findings, bool(changed[name])) for name, ids in in_shards.items()}
     findings.changed |= {name for name, files in changed.items() if files}
     for first in range(0, rows.num_rows, CHUNK):
         block = rows.slice(first, CHUNK)
@@ -255,10 +255,15 @@ def _levels_by_name(rows: pa.Table, column: str) -> dict[str, set[int]]:
     return named
 
 
-def _opened(name: str, recipe: Recipe, level_ids: set[int], findings: Findings) -> Shard | None:
+def _opened(name: str, recipe: Recipe, level_ids: set[int], findings: Findings, changed: bool) -> Shard | None:
+    """Open a shard; None: it is damaged. Raise DataUnread if its bytes are those committed, but cannot be read now."""
     try:
         shard = open_shard(recipe.split, name, recipe.size)
     except Failure as failure:
+        if not changed and isinstance(failure, DataUnread):
+            raise
+        if not changed and (machines := unread(recipe.split / name, failure.__cause__)):
+            raise machines from None
         findings.changed.add(name)
         findings.add(str(failure), level_ids)
         return None

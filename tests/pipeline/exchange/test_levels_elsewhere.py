@@ -217,6 +217,7 @@ def test_options_that_make_no_sense_are_refused(
         (sampled, [*seed, "--without-levels"], "leave out --without-levels"),
         (sampled, [*seed, "--levels", str(folder)], "leave out --levels"),
         (tmp_path, [*seed, "--levels", str(folder)], "is not one seed file"),
+        (whole, [*seed, "--levels", str(folder)], "has its levels"),
         (whole, [*seed, "--levels", str(folder), "-o", str(whole)], "already exists"),
     ):
         assert main(["export", str(source), *out, *words]) == 2

@@ -154,7 +154,7 @@ def test_policies_are_compared_on_the_same_levels_and_both_looks_are_logged(tmp_
         (tmp_path / name).write_text(act)
     (tmp_path / "three.py").write_text(act.replace("uniform *", "0 * uniform *"))
     split = tmp_path / "seeds.parquet"
-    done = here(["generate", "procedure=label", "budget=16k", "levels=32", f"first_level={SEALED.start}", "out=d",
+    done = here(["generate", "procedure=label", "budget=16k", "levels=32", f"first_level={SEALED.start - 16}", "out=d",
                  "executor=inline", "search.env_steps=4096", "search.variations=0"], tmp_path)  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert here(["export", "d/16k/s", "--format", "seed", "-o", str(split)], tmp_path).returncode == 0
@@ -164,7 +164,7 @@ def test_policies_are_compared_on_the_same_levels_and_both_looks_are_logged(tmp_
     for name in ("one", "two"):
         (look,) = (tmp_path / f"{name}.{LOOKS}").read_text().splitlines()
         assert json.loads(look)["on"] == {
-            str(split): {"levels": 32, "solved": same["of"]["all"]["agent"]["once"]["rate"]}
+            f"{split}, s": {"levels": 16, "solved": same["of"]["sealed"]["agent"]["once"]["rate"]}
         }
     done = here(["evaluate", "one.py", "--against", "three.py", "--levels", "32", "--attempts", "2"], tmp_path)
     assert re.search(r"policy less other, one attempt, level by level: [+-]\d+\.\d points \([+-]", done.stdout)

@@ -20,6 +20,7 @@ from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
 from levelproof.pipeline.errors import StoreFailure
 from levelproof.pipeline.jobs import repair as repairing
 from levelproof.pipeline.store import fragment, remote
+from levelproof.pipeline.store import shard as shards
 from levelproof.pipeline.store.checksums import digests_of, with_own
 from levelproof.pipeline.store.formats import DIGESTS_KEY, VERSION_KEY
 from levelproof.pipeline.store.job_note import note_job
@@ -262,7 +263,7 @@ def test_examine_bounds_the_lost_levels_of_a_damaged_fragment(split: Path, monke
 @pytest.mark.parametrize(
     "error", [OSError(errno.EIO, "Input/output error"), PermissionError(errno.EACCES, "no"), MemoryError()]
 )
-@pytest.mark.parametrize("step", ["has_own", "read_fragment", "digests_of", JOB])
+@pytest.mark.parametrize("step", ["has_own", "read_fragment", "digests_of", "open_shard", JOB])
 def test_repair_removes_nothing_that_it_cannot_read(
     split: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, step: str
 ) -> None:
@@ -271,6 +272,8 @@ def test_repair_removes_nothing_that_it_cannot_read(
     failing = raising(error)
     if step == "read_fragment":
         monkeypatch.setattr(fragment, "bounded", failing)
+    elif step == "open_shard":
+        monkeypatch.setattr(shards, "read_whole", failing)
     elif step == JOB:
         read = Path.read_bytes
         monkeypatch.setattr(Path, "read_bytes", lambda path: failing() if path.name == JOB else read(path))
@@ -278,6 +281,14 @@ def test_repair_removes_nothing_that_it_cannot_read(
         monkeypatch.setattr(verifying, step, failing)
     done = here(["verify", str(split), "--repair", "executor=inline"], split.parent)
     assert_refused(done, 1, str(split), "run the same command again" if step != "read_fragment" else "")
+    assert {path: path.stat().st_ino for path in split.rglob("*")} == before
+
+
+def test_repair_removes_no_shard_of_another_version(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = {path: path.stat().st_ino for path in split.rglob("*")}
+    monkeypatch.setattr(shards, "SHARD_VERSION", "another")
+    done = here(["verify", str(split), "--repair", "executor=inline"], split.parent)
+    assert_refused(done, 1, str(split), "use the levelproof that wrote it")
     assert {path: path.stat().st_ino for path in split.rglob("*")} == before
 
 
