@@ -1,10 +1,10 @@
 """Variations: evolution of whole trajectories until one reaches the goal.
 
 Each level keeps the few trajectories that brought green and blue nearest to each other, at first those to the nearest
-states in its archive. A lane plays a variation of
-one of them from the level's start: stretches are resampled or shifted in time. If the variation came nearer than a kept
-trajectory, it replaces it; then the lane plays another. Go-Explore resamples all actions after the state it returns to;
-a variation keeps the actions after a change, so it can correct an aim.
+states in its archive. A lane plays a variation of one of them from the level's start: stretches are resampled or
+shifted in time. If the variation came nearer than a kept trajectory, it replaces it; then the lane plays another.
+Go-Explore resamples all actions after the state it returns to; a variation keeps the actions after a change, so it can
+correct an aim.
 """
 
 from dataclasses import dataclass
@@ -159,7 +159,7 @@ def together(one: Array, other: Array) -> Array:
 
 
 def first_of(some: Approaches) -> Approaches:
-    """Return the NEAREST nearest trajectories; of several with the same gap only the first, if enough others exist."""
+    """Return NEAREST trajectories, those with the least gaps; of equal gaps only the first, if enough others exist."""
     order = jnp.argsort(some.gap, axis=-1)
     gaps = jnp.take_along_axis(some.gap, order, axis=-1)
     again = jnp.pad(gaps[:, 1:] == gaps[:, :-1], [(0, 0), (1, 0)])

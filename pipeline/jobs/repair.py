@@ -13,7 +13,7 @@ from rich.console import Console
 from levelproof.configs.compose import changed_settings, compose_job
 from levelproof.configs.errors import ConfigError
 from levelproof.configs.numbers import parse_count
-from levelproof.configs.schema import FROM_RECORDS, JobConfig, from_files, hash_of, is_grown
+from levelproof.configs.schema import JobConfig, from_files, hash_of
 from levelproof.pipeline.errors import Exit, Failure, UserError
 from levelproof.pipeline.jobs.generate import generate
 from levelproof.pipeline.jobs.progress import say
@@ -23,9 +23,8 @@ from levelproof.pipeline.store.layout import EXPERTS, data_paths, fragment_files
 from levelproof.pipeline.store.locks import is_written, without_commits
 from levelproof.pipeline.store.mend import take_out
 from levelproof.pipeline.store.runs import merged, runs, runs_text
-from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.store.split import locked, taken
-from levelproof.pipeline.verify.findings import Findings
+from levelproof.pipeline.verify.findings import Findings, why_not_repaired
 
 SETTINGS = ("executor", "workers", "unit", "device")  # settings of `generate` that a repair accepts
 STORAGE = ("density", "key_every", "keep_experts")  # settings of how results are stored
@@ -62,7 +61,8 @@ def repair(split: Path, settings: Sequence[str], console: Console) -> Exit:
     print(findings.report(split))
     if not findings.wrong:
         return Exit.DONE
-    _require_generated(split, findings)
+    if reason := why_not_repaired(split, findings):
+        raise UserError(reason)
     job = _job(split, findings, settings)
     left = _not_regenerated(findings)
     lost = findings.lost - findings.unrepairable.keys()
@@ -109,22 +109,6 @@ def _require_as_examined(split: Path, findings: Findings) -> None:
         raise Failure(
             f"Another command has changed {split} since it was examined: run the same command again, and no other one "
             "beside it."
-        )
-
-
-def _require_generated(split: Path, findings: Findings) -> None:
-    """Raise UserError for a split that no job generated: its actions are elsewhere, and cannot be regenerated."""
-    if is_seed(split):
-        raise UserError(f"{split} is a seed file, which is not repaired: copy it again from its source.")
-    if is_grown(findings.config or {}):
-        raise UserError(
-            f"The split {split} was grown from seed files, so it is not repaired: delete it and run `levelproof grow` "
-            "again."
-        )
-    if (findings.config or {}).get("distribution") == FROM_RECORDS:
-        raise UserError(
-            f"The split {split} was imported, so its levels cannot be regenerated: delete it, and import its folder of "
-            f"trajectories again with `levelproof import FOLDER -o {split}`."
         )
 
 

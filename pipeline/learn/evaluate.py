@@ -26,7 +26,7 @@ from levelproof.experts.networks.saved import BUILTIN, Policy
 from levelproof.levelgen.level import SIZES, name_of
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs.progress import say
-from levelproof.pipeline.learn.looks import LOOKS, log_look
+from levelproof.pipeline.learn.looks import LOOKS, SEALED, log_look
 from levelproof.pipeline.learn.measured import MeasuredLevels, is_split, levels_in, midway_levels, sealed_levels
 from levelproof.pipeline.learn.published import PROTOCOLS, published_levels
 from levelproof.pipeline.learn.sealed import SEALED as SEALED_IDS
@@ -38,7 +38,6 @@ from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.words import many
 
-SEALED = "sealed"
 ATTEMPTS = 8
 WIDE = 120  # columns of a table that no terminal shows: in 80, Rich would cut long rates
 NOTHING, POLICY, OTHER, AGENT = "doing nothing", "policy", "other", "agent"
@@ -96,10 +95,7 @@ def evaluate(
         if np.isin(group.level_ids, SEALED_IDS).any():  # in a split of them, too
             looked_at.append(facts[-1])
     for each in contestants if looked_at else ():
-        if looks := log_look(each.looks, each.main, looked_at, attempts, seed):
-            say(console, f"Look {looks} at the sealed levels; {each.looks} lists every look with this policy.")
-        elif not str(each.path).startswith(BUILTIN):  # those that come with levelproof were chosen before this look
-            say(console, f"Cannot write {each.looks}, so this look at the sealed levels is not recorded.")
+        _log(each, looked_at, attempts, seed, console)
     if as_json:
         others = {"against": str(against)} if against else {}
         about = {"policy": policy and str(policy), **others, "attempts": attempts, "seed": seed}
@@ -180,6 +176,14 @@ def _contestant(path: Path, title: str) -> _Contestant:
     greedy = _Entrant(play_most_probable(policy.network), policy.params, chance=False)
     main = f"{title}, sampled"
     return _Contestant(path, main, {main: sampled, f"{title}, greedy": greedy}, policy=policy)
+
+
+def _log(one: _Contestant, looked_at: Sequence[dict[str, Any]], attempts: int, seed: int, console: Console) -> None:
+    """Log a look at sealed levels beside the policy, and tell the user."""
+    if looks := log_look(one.looks, one.main, looked_at, attempts, seed):
+        say(console, f"Look {looks} at the sealed levels; {one.looks} lists every look with this policy.")
+    elif not str(one.path).startswith(BUILTIN):  # those that come with levelproof were chosen before this look
+        say(console, f"Cannot write {one.looks}, so this look at the sealed levels is not recorded.")
 
 
 def _own_experts(group: MeasuredLevels, on: str, splits: Sequence[Path], attempts: int) -> list[Specialists]:

@@ -15,6 +15,7 @@ from levelproof.pipeline.store.disk import NotRegular, read_regular
 from levelproof.pipeline.store.files import write
 
 LOOKS = "looks.jsonl"
+SEALED = "sealed"  # name of the sealed levels, and title of those among other levels
 
 
 def log_look(looks: Path, player: str, groups: Sequence[Mapping[str, Any]], attempts: int, seed: int) -> int | None:
@@ -30,7 +31,7 @@ def log_look(looks: Path, player: str, groups: Sequence[Mapping[str, Any]], atte
     rates = {
         group["levels"]: {"levels": sampled["levels"], "solved": sampled["once"]["rate"]}
         for group in groups
-        for sampled in [group["of"].get("sealed", group["of"]["all"])[player]]  # of a split, only those that are sealed
+        for sampled in [group["of"].get(SEALED, group["of"]["all"])[player]]  # of a split, only those that are sealed
     }
     look = {"at": datetime.now(UTC).isoformat(timespec="seconds"), "attempts": attempts, "seed": seed, "on": rates}
     before = b""

@@ -54,6 +54,8 @@ class DataUnread(Failure):
 
 def unread(path: Path, error: BaseException | None) -> DataUnread | None:
     """Return the error of a machine that cannot read `path`; None: the file is missing, or its bytes are damaged."""
+    if isinstance(error, DataUnread):
+        return error
     if isinstance(error, MemoryError):
         return DataUnread(f"There is too little memory to read {path}: free some, then run the same command again.")
     if not isinstance(error, OSError) or error.errno in (None, *ABSENT):  # Arrow's errors of damage have no number

@@ -5,9 +5,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from levelproof.configs.schema import FROM_RECORDS, is_grown
 from levelproof.pipeline.store.origins import Origin
 from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.runs import runs, runs_text
+from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.words import many
 
 
@@ -63,6 +65,24 @@ class Findings:
         counts = {name: getattr(self, name) for name in ("levels", "shards", "witnesses", "same_bits")}
         wrong = [{"what": sentence, "levels": runs(sorted(ids))} for sentence, ids in self.wrong.items()]
         return counts | {"wrong": wrong, "missing": self.missing}
+
+
+def why_not_repaired(split: Path, findings: Findings) -> str | None:
+    """Say why `verify --repair` cannot remake a split's levels, whose actions came from elsewhere; None: it can."""
+    config = findings.config or {}
+    if is_seed(split):
+        return f"{split} is a seed file, which is not repaired: copy it again from its source."
+    if is_grown(config):
+        return (
+            f"The split {split} was grown from seed files, so it is not repaired: delete it and run `levelproof grow` "
+            "again."
+        )
+    if config.get("distribution") == FROM_RECORDS:
+        return (
+            f"The split {split} was imported, so its levels cannot be regenerated: delete it, and import its folder of "
+            f"trajectories again with `levelproof import FOLDER -o {split}`."
+        )
+    return None
 
 
 def _levels(level_ids: Iterable[int]) -> str:

@@ -21,7 +21,7 @@ from rich.console import Console
 
 from levelproof.configs.convert import typed
 from levelproof.configs.errors import ConfigError
-from levelproof.configs.schema import FROM_RECORDS, from_files, is_grown
+from levelproof.configs.schema import from_files
 from levelproof.levelgen.identity.keys import ALIKE_VERSIONS, SAMPLER_VERSION
 from levelproof.levelgen.level import size_of
 from levelproof.levelgen.sampling.sampler import CHUNK, Distribution
@@ -64,7 +64,7 @@ from levelproof.pipeline.store.runs import runs, runs_text, without
 from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.store.shard import Shard
 from levelproof.pipeline.verify.evidence import COLUMNS, Evidence, Recipe, same_stack
-from levelproof.pipeline.verify.findings import Findings
+from levelproof.pipeline.verify.findings import Findings, why_not_repaired
 from levelproof.pipeline.verify.seeds import examine_seeds
 
 GROUP_ROWS = 4 * CHUNK  # minimum number of rows per group of fragments
@@ -85,15 +85,9 @@ def verify(split: Path, as_json: bool, console: Console) -> Exit:
         print(json.dumps(findings.as_json(), indent=2))
     else:
         print(findings.report(split))
-        if findings.wrong and not is_remote(split) and _is_repaired(split, findings):
+        if findings.wrong and not is_remote(split) and not why_not_repaired(split, findings):
             print(f"Next:  levelproof verify {shlex.quote(str(split))} --repair")
     return Exit.FAILED if findings.wrong else Exit.DONE
-
-
-def _is_repaired(split: Path, findings: Findings) -> bool:
-    """Whether `verify --repair` may remake what is wrong; actions that came from elsewhere it cannot."""
-    config = findings.config or {}
-    return not is_seed(split) and not is_grown(config) and config.get("distribution") != FROM_RECORDS
 
 
 def examine(split: Path, console: Console | None = None) -> Findings:
@@ -260,9 +254,8 @@ def _opened(name: str, recipe: Recipe, level_ids: set[int], findings: Findings, 
     try:
         shard = open_shard(recipe.split, name, recipe.size)
     except Failure as failure:
-        if not changed and isinstance(failure, DataUnread):
-            raise
-        if not changed and (machines := unread(recipe.split / name, failure.__cause__)):
+        path = recipe.split / name
+        if not changed and (machines := unread(path, failure) or unread(path, failure.__cause__)):
             raise machines from None
         findings.changed.add(name)
         findings.add(str(failure), level_ids)
