@@ -17,6 +17,7 @@ from levelproof.levelgen.programs import LOADED, StoredProgram, jit_stored
 from levelproof.levelgen.proofs import examine
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
+from levelproof.physics.codegen import kept
 
 SCRIPT = """
 from levelproof.pipeline.runtime import prepare_jax
@@ -37,8 +38,9 @@ print(np.asarray(facts).tobytes().hex())
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Iterator[Path]:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """An empty folder for stored programs and for JAX's own."""
+    monkeypatch.setattr(kept, "BEGAN", float("inf"))  # a source may have been checked out or edited a moment ago
     before = jax.config.values["jax_compilation_cache_dir"]
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     compilation_cache.reset_cache()
