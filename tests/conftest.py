@@ -17,7 +17,6 @@ pytest_plugins = ["tests.order"]
 
 ROOT = Path(__file__).parent.parent
 REQUIRE_ORACLE = "LEVELPROOF_TEST_ORACLE"
-MAX_MAPS = 40_000
 
 # Workers and the commands that tests start inherit the cache folder. Set up before any test touches JAX.
 os.environ.setdefault(CACHE_VARIABLE, str(ROOT / ".pytest_cache" / "levelproof"))
@@ -62,15 +61,9 @@ def compiling(request: pytest.FixtureRequest) -> None:
 
 @pytest.fixture(autouse=True, scope="module")
 def room_for_programs() -> Iterator[None]:
-    """Drop compiled programs when the process holds too many memory maps.
-
-    Each program takes several maps. Linux allows a process 65,530, and XLA crashes when it gets no more. JAX reloads
-    dropped programs from the cache folder.
-    """
+    """Keep the process's memory maps below Linux's limit from one module to the next."""
     yield
-    maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > MAX_MAPS:
-        jax.clear_caches()
+    quick.make_room()
 
 
 @pytest.fixture(scope="session")

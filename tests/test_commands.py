@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.pipeline.command import here, run
+from tests.quick import make_room
 
 pytestmark = pytest.mark.campaign
 
@@ -50,6 +51,7 @@ def commands(page: Path) -> list[list[str]]:
 
 def run_command(words: list[str], folder: Path, inline: bool) -> None:
     """Run a command in its own process if it starts workers, else in this one; `inline` jobs start none."""
+    make_room()  # a page compiles as much as most modules
     inline &= words[0] in JOBS
     starts = words[0] in JOBS or "--repair" in words
     executor = [f"executor={'inline' if inline else 'ray'}"] if words[0] in JOBS else []

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from levelproof.levelgen.files.kinetix import level_from_kinetix
-from levelproof.levelgen.files.level_file import LevelFile, read_level_file, write_level_file
+from levelproof.levelgen.files.level_file import LevelFile, read_level_file, with_known_bindings, write_level_file
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import Distribution, sample_levels
 from levelproof.levelgen.task.rules import TaskParams, TaskState, advance
@@ -85,10 +85,13 @@ def test_handmade_levels_survive_a_round_trip(handmade, size, tmp_path) -> None:
 
 @pytest.mark.parametrize("size", SIZES)
 def test_reference_opens_the_same_levels(played, size) -> None:
-    """Bit for bit: the handmade levels as we read them, and ours as we wrote them."""
+    """Bit for bit: the handmade levels as we read them, and ours as we wrote them.
+
+    All but the bindings of inactive thrusters, to which two of the handmade levels give one that no action has.
+    """
     run = played(size)
     assert len(run.files) == HANDMADE[size] + 1 + OURS
-    assert_same(side_by_side(run.files), run.levels())
+    assert_same(side_by_side(run.files), with_known_bindings(run.levels()))
 
 
 @pytest.mark.parametrize("size", SIZES)
