@@ -12,7 +12,7 @@ import pickle
 import threading
 import time
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, cached_property, partial, update_wrapper
 from importlib.metadata import version
 from pathlib import Path
@@ -27,6 +27,11 @@ from llvmlite import binding
 from levelproof.physics.codegen.compile import register, texts_in
 from levelproof.physics.codegen.kept import cache_is_on, key_by_sources, store, stored
 
+# XLA's options for CPUs. Level 1 of its optimiser makes programs as fast as level 3 does, in four fifths of the time.
+# Its older code for fusions gives LLVM half as much to do, but slows down networks and the search. A program compiled
+# with other options may round otherwise.
+OPTIMISED = {"xla_backend_optimization_level": 1}
+OLDER_FUSIONS = OPTIMISED | {"xla_cpu_use_fusion_emitters": False}
 UNOPTIMISED = {"xla_backend_optimization_level": 0}
 SOURCES = [Path(__file__).parents[1] / room for room in ("physics", "levelgen", "experts")]
 LOADED = "/jax/core/compile/levelproof_load"  # event that counts as compiling, as JAX's own do
@@ -47,13 +52,14 @@ class Call(NamedTuple):
 class StoredProgram(Generic[T]):
     """A jitted function, whose programs are stored beside JAX's compiled ones.
 
-    Called within `jax.jit`, on a GPU, on several devices or without a folder for the cache, it is `jax.jit` alone.
+    Called on a GPU, on several devices or without a folder for the cache, it is `jax.jit` alone. Called within another
+    program, it is compiled with that program's options.
     """
 
     __name__: str  # the function's
 
-    def __init__(self, function: Callable[..., T], optimise: bool = True, **settings: Any) -> None:
-        self.function, self.optimise, self._settings = function, optimise, settings
+    def __init__(self, function: Callable[..., T], options: Mapping[str, Any] = OPTIMISED, **settings: Any) -> None:
+        self.function, self.options, self._settings = function, options, settings
         self._signature, self._programs = inspect.signature(function), dict[Call, Any]()
         self._locks: dict[Call, threading.Lock] = {}
         names = settings.get("static_argnames", ())
@@ -63,13 +69,18 @@ class StoredProgram(Generic[T]):
     @cached_property
     def program(self) -> Any:
         """The jitted function; made on first use, because `jax.default_backend` starts the backend."""
-        quick = not self.optimise and jax.default_backend() == "cpu"
-        return jax.jit(self.function, compiler_options=UNOPTIMISED if quick else None, **self._settings)
+        options = dict(self.options) if jax.default_backend() == "cpu" else None
+        return jax.jit(self.function, compiler_options=options, **self._settings)
+
+    @cached_property
+    def _part(self) -> Any:
+        """The jitted function as a part of another program, which JAX allows no options of its own."""
+        return jax.jit(self.function, **self._settings)
 
     def __call__(self, *args: Any, **kwargs: Any) -> T:
         given, call = self._call(args, kwargs)
         if call is None:
-            return self.program(*args, **kwargs)
+            return (self._part if _traced(given) else self.program)(*args, **kwargs)
         return self._ready(call, args, kwargs)(*given)
 
     def prepare(self, *args: Any, **kwargs: Any) -> None:
@@ -99,9 +110,9 @@ class StoredProgram(Generic[T]):
         bound = self._bound(args, kwargs)
         static = tuple(value for name, value in bound.arguments.items() if name in self._static)
         given = [value for name, value in bound.arguments.items() if name not in self._static]
-        leaves, tree = jax.tree.flatten(given)
-        if any(isinstance(x, Tracer) for x in leaves) or not _alone() or not cache_is_on():
+        if _traced(given) or not _alone() or not cache_is_on():
             return given, None
+        leaves, tree = jax.tree.flatten(given)
         return given, Call(static, tree, tuple(map(_type_of, leaves)), _settings())
 
     def _bound(self, args: Any, kwargs: Any) -> inspect.BoundArguments:
@@ -121,7 +132,7 @@ class StoredProgram(Generic[T]):
 
     def _found_or_made(self, call: Call, args: Any, kwargs: Any) -> Any:
         name = f"{self.function.__module__}.{self.function.__qualname__}"
-        request = f"{name} {self.optimise} {self._settings} {call} {_machine()}"
+        request = f"{name} {self.options} {self._settings} {call} {_machine()}"
         # An object without a text of its own has its address, which means nothing to another process
         key = None if " at 0x" in request else key_by_sources(request, SOURCES)
         place = stored(key) if key else None
@@ -135,7 +146,7 @@ class StoredProgram(Generic[T]):
             return lowered.compile()
         text = lowered.as_text()
         # The text leaves out arguments that nothing reads, but a loaded program checks the shapes of all
-        described = f"{text} {call.tree} {call.types} {self.optimise} {_machine()}"
+        described = f"{text} {call.tree} {call.types} {self.options} {_machine()}"
         place = "program " + hashlib.sha256(described.encode()).hexdigest()
         if program := _load(place, call):
             store(key, place.encode())
@@ -149,19 +160,30 @@ class StoredProgram(Generic[T]):
 
 
 def jit_stored(**settings: Any) -> Callable[[Callable[..., T]], StoredProgram[T]]:
-    """Return a decorator that makes functions `StoredProgram`; settings are those of `jax.jit`."""
+    """Return a decorator that makes functions `StoredProgram`; settings are those of `jax.jit`.
+
+    For programs in which much of a job's time goes into a network or an archive: training and the search.
+    """
     return partial(StoredProgram, **settings)  # pyright: ignore[reportReturnType]
+
+
+def jit_sooner(**settings: Any) -> Callable[[Callable[..., T]], StoredProgram[T]]:
+    """Return a decorator as `jit_stored` does, for functions whose time goes into physics, or that run briefly.
+
+    XLA compiles them for CPUs in about half the time. They run no slower: physics is our own machine code.
+    """
+    return partial(StoredProgram, options=OLDER_FUSIONS, **settings)  # pyright: ignore[reportReturnType]
 
 
 def jit_quickly(**settings: Any) -> Callable[[Callable[..., T]], StoredProgram[T]]:
     """Return a decorator as `jit_stored` does, for functions that run too briefly to repay optimisation.
 
-    XLA compiles them for CPUs without optimising, in about half the time. It then rounds every product before adding to
-    it, where the optimiser may merge a multiplication and an addition into one operation. So a function with products
-    of floats may change its bits: use this only for functions without any (tests/pipeline/jobs/test_programs.py).
-    Physics is our own machine code, which stays optimised. Such a function cannot be called inside `jax.jit`.
+    XLA compiles them for CPUs without optimising. It then rounds every product before adding to it, where the optimiser
+    may merge a multiplication and an addition into one operation. So a function with products of floats may change its
+    bits: use this only for functions without any (tests/pipeline/jobs/test_programs.py). Physics is our own machine
+    code, which stays optimised.
     """
-    return partial(StoredProgram, optimise=False, **settings)  # pyright: ignore[reportReturnType]
+    return partial(StoredProgram, options=UNOPTIMISED, **settings)  # pyright: ignore[reportReturnType]
 
 
 class _FreshlyCompiled(threading.local):
@@ -204,6 +226,11 @@ def _load(place: str, call: Call) -> Any:
         return None
     monitoring.record_event_duration_secs(LOADED, time.perf_counter() - begun)
     return program
+
+
+def _traced(given: Any) -> bool:
+    """Whether JAX is tracing another program, of which this call is a part."""
+    return any(isinstance(x, Tracer) for x in jax.tree.leaves(given))
 
 
 def _alone() -> bool:

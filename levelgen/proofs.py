@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Int
 
 from levelproof.levelgen.level import ACTIONS, Level, Role
-from levelproof.levelgen.programs import jit_stored
+from levelproof.levelgen.programs import jit_sooner
 from levelproof.levelgen.task.rules import TaskParams, TaskState, advance, has_nan, has_roles, reset
 from levelproof.physics.manifold import may_touch
 from levelproof.physics.pairs import pairs_of
@@ -49,7 +49,7 @@ class Idle(NamedTuple):
     breaks: Bool[Array, " lane"]  # the world broke down first
 
 
-@jit_stored(static_argnames=("rules", "env_steps"))
+@jit_sooner(static_argnames=("rules", "env_steps"))
 def examine(level: Level, rules: TaskParams, env_steps: int) -> Facts:
     """Establish the facts by idling for `env_steps` env steps; a longer episode proves nothing."""
     idle = stay_idle(level, rules, env_steps)

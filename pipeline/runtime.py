@@ -3,6 +3,7 @@
 Takes effect only before JAX starts its backend.
 """
 
+import gc
 import os
 import socket
 import sys
@@ -93,6 +94,7 @@ def prepare_jax(
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     share_compiling()
+    gc.freeze()  # garbage collection skips what the imports made: tracing makes much, and the collector runs often
 
 
 def remove_damaged(folder: Path) -> None:

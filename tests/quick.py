@@ -17,7 +17,7 @@ from levelproof.levelgen.programs import UNOPTIMISED
 FAST_COMPILING = "jax_disable_most_optimizations"  # a setting of JAX
 # XLA's older code for fusions takes LLVM half as long as what replaces it. JAX has no setting for such options, and the
 # environment's would count for all modules of tests.
-FASTER = {"xla_cpu_use_fusion_emitters": False}
+FASTER: dict[str, Any] = UNOPTIMISED | {"xla_cpu_use_fusion_emitters": False}
 # Tests that compile many programs and run each briefly. Records are kernels of our own, whose bits do not depend on
 # XLA. No test here compares other bits with those of a process that optimises.
 BRIEF = (
@@ -59,8 +59,8 @@ def is_brief(nodeid: str) -> bool:
 
 
 def fast_options(*given: Any, env_options_overrides: dict[str, Any] | None = None, **named: Any) -> Any:
-    """Return the options of a program, as JAX does, with those that make compiling faster."""
-    overrides = FASTER | dict(env_options_overrides or {})
+    """Return the options of a program, as JAX does, with those that make compiling faster in place of its own."""
+    overrides: dict[str, Any] = (env_options_overrides or {}) | FASTER
     return options_of(*given, env_options_overrides=overrides, **named)
 
 

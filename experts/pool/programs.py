@@ -21,7 +21,7 @@ from levelproof.experts.witness.success import no_success
 from levelproof.experts.witness.witness import replay_block
 from levelproof.levelgen.batching import LANES, at_once
 from levelproof.levelgen.level import ACTIONS, Level
-from levelproof.levelgen.programs import StoredProgram
+from levelproof.levelgen.programs import TRACING, StoredProgram
 from levelproof.levelgen.proofs import examine
 from levelproof.physics.buffers import buffers_of
 from levelproof.physics.types import Size
@@ -40,12 +40,16 @@ class Program(NamedTuple):
 
     def prepare(self) -> None:
         """Load or compile it, for this process and others with the same cache folder."""
-        arguments, settings = self.call()
+        with TRACING:
+            arguments, settings = self.call()
         self.function.prepare(*arguments, **settings)
 
 
 def programs_of(pool: Pool, size: Size) -> list[Program]:
-    """Return the programs that most jobs of this size use, those that take longest to compile first."""
+    """Return the programs that most jobs of this size use, those that take longest to compile first.
+
+    Except that `advance` comes second: only one thread traces at a time, and this takes two seconds.
+    """
     trains = pool.procedure.stop.rule != Rule.NONE
     programs = searching(pool, size) + (training(pool, size) if trains else []) + judging(pool, size, trains)
     rank = {function: number for number, function in enumerate(LONGEST)}
@@ -136,16 +140,16 @@ def ids_of(count: int) -> jax.ShapeDtypeStruct:
 
 # By seconds of compiling, measured for levels of size s; all others take less
 LONGEST = (
-    advance,
     explore.explore_rounds,
-    begin,
-    vary.vary_rounds,
-    afresh.attempt_block,
+    advance,
     strengthen.strengthen,
+    afresh.attempt_block,
+    vary.vary_rounds,
+    begin,
     replay_block,
+    portability.survival_block,
+    shorten,
     explore.begin,
     examine,
-    portability.survival_block,
     entered,
-    shorten,
 )

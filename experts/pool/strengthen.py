@@ -19,7 +19,7 @@ from levelproof.experts.verdict.portability import moved, survivors
 from levelproof.experts.witness.success import Success
 from levelproof.levelgen.batching import repeat
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.programs import jit_stored
+from levelproof.levelgen.programs import jit_sooner
 from levelproof.levelgen.task.rules import TaskParams
 
 LANES = 64  # per level; the first plays the witness itself, the others variations
@@ -37,7 +37,7 @@ class Strengthening(NamedTuple):
     number: Int[Array, ""]  # of rounds done
 
 
-@jit_stored(static_argnames=("rounds", "rules"))
+@jit_sooner(static_argnames=("rounds", "rules"))
 def strengthen(
     levels: Level, level_ids: Int[Array, " level"], success: Success, rounds: int, rules: TaskParams
 ) -> Shortened:

@@ -19,7 +19,7 @@ from levelproof.experts.search.play import CODES, Arena, Walk, arena, best_lane,
 from levelproof.experts.search.rows import from_rows, to_rows
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import ACTIONS, Level
-from levelproof.levelgen.programs import jit_stored
+from levelproof.levelgen.programs import jit_sooner, jit_stored
 from levelproof.levelgen.task.rules import TaskParams
 
 LEAST_PATIENCE = 0.25  # share of the patience that is left however wide the gap is
@@ -51,7 +51,7 @@ class RoundDraws(NamedTuple):
     bits: UInt32[Array, "segment time 6 lane"]  # bits for the actions that follow
 
 
-@jit_stored(static_argnames=("config", "rules"))
+@jit_sooner(static_argnames=("config", "rules"))
 def begin(levels: Level, level_ids: Int[Array, " level"], config: SearchConfig, rules: TaskParams) -> Search:
     """Start a search: archives contain the levels' first states alone.
 

@@ -22,7 +22,7 @@ from levelproof.experts.search.vary import Varying, nearest_of
 from levelproof.experts.witness.success import Success, no_success
 from levelproof.levelgen.batching import at_once, blocks, take
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.programs import jit_stored
+from levelproof.levelgen.programs import jit_sooner
 from levelproof.levelgen.task.rules import TaskParams
 
 IN_CACHE = 256  # lanes: their physics and archives fit the cache of a core
@@ -185,7 +185,7 @@ def side_by_side(config: SearchConfig) -> int:
     return at_once(config.lanes, IN_CACHE)
 
 
-@jit_stored()
+@jit_sooner()
 def explored(search: Search, ends: StopLimits) -> tuple[Bool[Array, " level"], SearchResult]:
     """Return which levels are done, and the results of all levels so far."""
     success, none = success_of(search.code, search.length), jnp.zeros_like(search.env_steps)
@@ -193,7 +193,7 @@ def explored(search: Search, ends: StopLimits) -> tuple[Bool[Array, " level"], S
     return ~explore.under_way(search, ends), result
 
 
-@jit_stored()
+@jit_sooner()
 def varied(varying: Varying, ends: StopLimits) -> tuple[Bool[Array, " level"], tuple[Success, Int[Array, " level"]]]:
     """Return which levels are done, and successes and env steps of all levels so far."""
     return ~vary.under_way(varying, ends), (success_of(varying.code, varying.length), varying.env_steps)

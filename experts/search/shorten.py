@@ -18,7 +18,7 @@ from levelproof.experts.search.edit import Draws, draw, edits, shortening, varia
 from levelproof.experts.search.play import Arena, Walk, act, arena, best_lane, code_of, decode, fresh_walk, success_of
 from levelproof.experts.witness.success import Success
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.programs import jit_stored
+from levelproof.levelgen.programs import jit_sooner
 from levelproof.levelgen.task.measures import goal_distance
 from levelproof.levelgen.task.rules import TaskParams
 
@@ -42,7 +42,7 @@ class Polishing(NamedTuple):
     number: Int[Array, ""]  # of rounds done
 
 
-@jit_stored(static_argnames=("config", "rules"))
+@jit_sooner(static_argnames=("config", "rules"))
 def shorten(
     levels: Level, level_ids: Int[Array, " level"], success: Success, config: SearchConfig, rules: TaskParams
 ) -> Shortened:

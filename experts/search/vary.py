@@ -22,7 +22,7 @@ from levelproof.experts.search.near import FAR, gap
 from levelproof.experts.search.play import CODES, Arena, Walk, act, arena, decode, fresh_walk, most_steps
 from levelproof.experts.search.rows import from_rows, to_rows
 from levelproof.levelgen.level import ACTIONS, Level
-from levelproof.levelgen.programs import jit_quickly, jit_stored
+from levelproof.levelgen.programs import jit_quickly, jit_sooner
 from levelproof.levelgen.task.rules import TaskParams
 
 BEYOND = 16  # env steps played beyond the step at which the varied trajectory was nearest
@@ -65,7 +65,7 @@ class Varying:
     length: Int[Array, " level"]  # of the success, env steps; 0: none
 
 
-@jit_stored()
+@jit_sooner()
 def nearest_of(archive: Archive) -> Approaches:
     """Return the trajectories to the archived states nearest to the goal; each repeats its last action to the end."""
     entry = archive.entry
@@ -107,7 +107,7 @@ def vary(varying: Varying, config: SearchConfig, rules: TaskParams) -> Varying:
     return vary_rounds(varying, config.ends, config.endless, rules)
 
 
-@jit_stored(static_argnames=("config", "rules"), donate_argnames="varying")
+@jit_sooner(static_argnames=("config", "rules"), donate_argnames="varying")
 def vary_rounds(varying: Varying, ends: StopLimits, config: SearchConfig, rules: TaskParams) -> Varying:
     ring = arena(varying.levels, config.lanes, (1.0,))
     step = lambda varying, _: (vary_round(varying, ring, ends, config, rules), None)

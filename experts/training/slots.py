@@ -21,7 +21,7 @@ from levelproof.experts.witness.success import Success
 from levelproof.levelgen.batching import repeat
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.programs import jit_quickly, jit_stored
+from levelproof.levelgen.programs import jit_quickly, jit_sooner
 from levelproof.levelgen.task.actions import CHOICES
 
 
@@ -122,7 +122,7 @@ class Report(NamedTuple):
     early: Bool[Array, " slot"]  # the level left solved, before its final evaluation
 
 
-@jit_stored(static_argnames="config")
+@jit_sooner(static_argnames="config")
 def begin(levels: Level, level_ids: Int[Array, " level"], success: Success, config: ExpertConfig) -> ExpertState:
     """Initialise experts, level axis first; they know nothing but the success, if there is one."""
     network, lanes = network_of(levels.size, config), config.environments

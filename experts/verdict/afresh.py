@@ -19,7 +19,7 @@ from levelproof.experts.verdict.portability import IN_CACHE
 from levelproof.levelgen.batching import at_once, blocks, repeat, take
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.programs import jit_stored
+from levelproof.levelgen.programs import jit_sooner
 from levelproof.levelgen.task.rules import TaskParams
 
 PART = 16  # env steps between checks whether all attempts have ended
@@ -63,7 +63,7 @@ def attempt(
     return AttemptResults(*(np.concatenate(column)[: len(level_ids)] for column in zip(*parts, strict=True)))
 
 
-@jit_stored(static_argnames=("config", "rules"))
+@jit_sooner(static_argnames=("config", "rules"))
 def attempt_block(
     levels: Level, level_ids: Int[Array, " level"], params: Params, config: ExpertConfig, rules: TaskParams
 ) -> AttemptResults:

@@ -18,7 +18,7 @@ from levelproof.experts.verdict.judge import Witness
 from levelproof.levelgen.batching import at_once, block_size, blocks, take
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.programs import jit_stored
+from levelproof.levelgen.programs import jit_sooner
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.types import State
 
@@ -83,7 +83,7 @@ def survival(
     return np.concatenate([np.zeros(0, np.float32), *shares])[: len(witnesses)]
 
 
-@jit_stored(static_argnames=("replays", "rules"))
+@jit_sooner(static_argnames=("replays", "rules"))
 def survival_block(
     levels: Level,
     level_ids: Int[Array, " level"],

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from levelproof.levelgen.batching import blocks, take
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.programs import jit_stored
+from levelproof.levelgen.programs import jit_sooner
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import controls
 from levelproof.levelgen.task.measures import world_points
@@ -77,7 +77,7 @@ def steps_to_goal(done: ArrayLike) -> Int[np.ndarray, " level"]:
     return np.argmax(np.asarray(done), axis=0) + 1
 
 
-@jit_stored(static_argnames="rules")
+@jit_sooner(static_argnames="rules")
 def replay_block(level: Level, action: Int[Array, "256 6 lane"], rules: TaskParams) -> Record:
     def act(carry: tuple[TaskState, Manifold], action):
         now, manifold = carry

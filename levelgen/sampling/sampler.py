@@ -6,7 +6,6 @@ processor, or XLA operations on devices without it. `sampling.block` has the ord
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from levelproof.levelgen.identity.keys import FRESH_BITS, Stream, level_id_array
 from levelproof.levelgen.level import KERNEL_SOURCES, Level, name_of, size_of
+from levelproof.levelgen.programs import jit_sooner
 from levelproof.levelgen.sampling.block import GOAL_BODIES, Results, Workspace, layout_of, sample_block, scratch_of
 from levelproof.levelgen.sampling.distribution import Distribution
 from levelproof.levelgen.sampling.draft import SCENERY, SceneryTable, clear
@@ -117,7 +117,7 @@ class Sampler:
         return single(lambda _, level_ids, __: self.lanes(level_ids))
 
 
-@partial(jax.jit, static_argnames=("size", "distribution"))
+@jit_sooner(static_argnames=("size", "distribution"))
 def sample_chunk(level_ids: Int[Array, " lane"], size: Size, distribution: Distribution) -> Level:
     """Sample one chunk of levels."""
     return sample(level_ids, size, distribution)

@@ -7,8 +7,9 @@ from pathlib import Path
 
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.pool.pool import Pool
-from levelproof.experts.pool.programs import Program, programs_of
+from levelproof.experts.pool.programs import Program, ids_of, programs_of
 from levelproof.levelgen.level import size_of
+from levelproof.levelgen.sampling.sampler import CHUNK, sample_chunk
 from levelproof.pipeline.claims import try_claim
 from levelproof.pipeline.jobs.likeness import program_of
 from levelproof.pipeline.runtime import cache_folder
@@ -25,7 +26,7 @@ class Ahead:
     """
 
     def __init__(self, job: JobConfig, pool: Pool) -> None:
-        folder, programs = cache_folder() / "jax", programs_of(pool, size_of(job.size))
+        folder, programs = cache_folder() / "jax", [*programs_of(pool, size_of(job.size)), *_sampling(job)]
         search = job.search.scaled(size_of(job.size).bodies)
         of_code = [entry for entry in program_of(job).items() if entry[0] != "configuration"]
         settings = job.size, job.expert, search.endless, search.robustness, job.task, of_code, device()
@@ -68,6 +69,13 @@ class Ahead:
     def compiled(self) -> tuple[int, int]:
         """Number of compiled programs, and of all."""
         return sum(map(_is_done, self._programs)), len(self._programs)
+
+
+def _sampling(job: JobConfig) -> list[Program]:
+    """Return the program that samples levels, unless they come from files."""
+    settings = size_of(job.size), job.distribution
+    program = Program(sample_chunk, lambda: ((ids_of(CHUNK), *settings), {}), f"of {job.distribution}")
+    return [] if job.level_files else [program]
 
 
 def _claim(folder: Path, program: Program, settings: str) -> Path:

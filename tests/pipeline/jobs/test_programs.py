@@ -17,6 +17,7 @@ from levelproof.experts.pool.pool import Pool
 from levelproof.experts.pool.programs import Program, programs_of
 from levelproof.experts.pool.run import TrainingRun
 from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.programs import UNOPTIMISED
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.physics.codegen.compile import NAME
 from levelproof.pipeline.claims import try_claim
@@ -94,7 +95,7 @@ def test_ahead_skips_what_another_process_compiles(job: JobConfig, pool: Pool, c
 
 
 def test_programs_without_optimiser_multiply_no_floats(programs: list[Program]) -> None:
-    quick = [program for program in programs if not program.function.optimise]
+    quick = [program for program in programs if program.function.options == UNOPTIMISED]
     decorated = [path.read_text().count("\n@jit_quickly") for path in (ROOT / "experts").rglob("*.py")]
     assert len({program.function for program in quick}) == sum(decorated)
     for program in quick:
