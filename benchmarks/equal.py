@@ -37,14 +37,15 @@ class Way(NamedTuple):
     settings: Sequence[str]  # of `levelproof train`, which has the rest of the core-seconds
     start: str = ""  # policy that training starts from; CLONE: one that is made first
     colour: str = "#777777"
-    own_levels: bool = False  # whether to train on the solved levels that the clone learned from
+    own_levels: bool = False  # whether to train on solved levels that are searched first: those of the clone, if any
 
 
 CLONE = "clone"
-CLONING = Lock()  # several ways share a clone
+SEARCHING = Lock()  # several ways share levels and a clone
 WAYS = {
     "from scratch": Way(SCRATCH, colour="#0072b2"),
     "from scratch, learnability": Way((*SCRATCH, "levels=learnability"), colour="#56b4e9"),
+    "levels, reinforcement on these levels": Way(SCRATCH, colour="#000000", own_levels=True),
     "levels, clone, reinforcement": Way(TUNING, CLONE, "#d55e00"),
     "levels, clone, learnability": Way((*TUNING, "levels=learnability"), CLONE, "#e69f00"),
     "levels, clone, reinforcement on these levels": Way(TUNING, CLONE, "#cc79a7", own_levels=True),
@@ -98,9 +99,12 @@ def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
     folder = args.folder / f"{slug(way)}-{args.size}-{seed}"
     start, before, clone = WAYS[way].start, 0.0, None
     if start == CLONE:
-        with CLONING:
+        with SEARCHING:
             start, before = cloned(args, seed)
             clone = kept(args.folder / f"clone-{args.size}-{seed}-{args.measured}.json", start, *measuring(args))
+    elif WAYS[way].own_levels:
+        with SEARCHING:
+            before = searched(args, seed)
     curve = trained(args, folder, way, start, seed, args.core_seconds - before)
     rates = kept(args.folder / f"{folder.name}-{curve[-1][STEPS]}-{args.measured}.json", folder, *measuring(args))
     return {"way": way, "seed": seed, "before": before, "curve": curve, "sealed": rates, "clone": clone}

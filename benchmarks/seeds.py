@@ -9,7 +9,7 @@ import argparse
 import json
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,77 +32,107 @@ from levelproof.pipeline.store.seed.file import seed_files
 
 BATCH = 64
 TRAJECTORIES = 2048  # of the seeds that are read, the first ones
-SEEDS = Path(__file__).parent.parent / "manifests" / "16k" / "s"
+MANIFESTS = Path(__file__).parent.parent / "manifests"
+SEEDS = [MANIFESTS / "16k" / "s", MANIFESTS / "16k" / "m", MANIFESTS / "256k" / "l"]
 OBSERVATION = "symbolic_flat"
 RELEASED, PLOT = "released data", "seeds.svg"
 PUBLISHED_LEVELS, PUBLISHED_BYTES = 11_500_000, 326e9  # solved levels of Kinetix-Offline, and its size
 
 
 def register(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("seeds", type=Path, nargs="?", default=SEEDS, help="seed files (default: manifests/16k/s)")
+    parser.add_argument(
+        "seeds", type=Path, nargs="*", default=SEEDS, help="folders of seed files, of one size each (default: 3)"
+    )
     parser.add_argument("--seconds", type=float, default=20.0, help="CPU seconds of each measurement (default: 20)")
     parser.add_argument("--without-reference", action="store_true", help="leave out the reference's reader")
 
 
 def run(args: argparse.Namespace) -> Report:
     prepare_jax(own_cores()[0])
-    sizes = stored(args.seeds)
-    with tempfile.TemporaryDirectory() as folder:
-        split = Path(folder, "full", sizes["budget"], sizes["size"])
-        part = Path(folder, "part.parquet")
-        rates, versions = read(args.seeds, part, split, args.seconds, args.without_reference)
-        kept = bytes_of(part, sizes["size"])
-    solved, other = sizes["solved"], sizes["levels"] - sizes["solved"]
-    per_level = sizes["bytes"] / solved
-    columns = sorted(sizes["columns"].items(), key=lambda item: -item[1])
+    found, versions = [], {}
+    for seeds in args.seeds:
+        sizes = stored(seeds)
+        with tempfile.TemporaryDirectory() as folder:
+            split, part = Path(folder, "full", sizes["budget"], sizes["size"]), Path(folder, "part.parquet")
+            rates, versions = read(seeds, part, split, args.seconds, args.without_reference)
+            found.append({**sizes, "per_trajectory": bytes_of(part, sizes["size"]), "rates": rates})
+    kept = found[0]["per_trajectory"]
     return Report(
         title="Seeds",
-        results=[
-            {"what": "bytes", **sizes, "per_trajectory": kept},
-            {"what": "rates", "unit": "transitions/s of a core", **rates},
-        ],
-        tables=[
-            Table(
-                ("column", "bytes", "per solved level"),
-                [[name, f"{size:,}", f"{size / solved:.2f}"] for name, size in columns],
-                f"{sizes['levels']:,} levels of {sizes['size']} at {sizes['budget']}, {solved:,} of them solved",
-            ),
-            Table(
-                ("stored as", "bytes per trajectory", "of released data's"),
-                [[name, f"{size:,.0f}", f"{size / kept[RELEASED]:.2%}"] for name, size in kept.items()],
-                f"Trajectories of {sizes['size']} in every density",
-            ),
-            Table(
-                ("read from", "transitions/s", "trajectories/s", "against Lanes"),
-                [
-                    [name, f"{rate['transitions']:,.0f}", f"{rate['trajectories']:,.0f}" if "trajectories" in rate else
-                     "-", f"{rate['transitions'] / rates['Lanes']['transitions']:.2f}"]
-                    for name, rate in rates.items()
-                ],
-                f"First episodes in random batches of {BATCH}, with {OBSERVATION} observations; per second of CPU time",
-            ),
-        ],
+        results=found,
+        tables=[files_of(found), columns_of(found), densities_of(found), rates_of(found)],
         notes=[
-            f"The files have {sizes['bytes']:,} bytes: {per_level:.1f} per solved level, with the {other:,} others, "
-            "their labels and all metadata included.",
-            f"At that rate {PUBLISHED_LEVELS:,} solved levels of this size would take "
-            f"{PUBLISHED_LEVELS * per_level / 1e6:,.0f} MB, where the {PUBLISHED_LEVELS:,} of the released dataset, of "
-            f"three sizes, take {PUBLISHED_BYTES / 1e9:,.0f} GB. Seeds keep first episodes; what follows in a released "
-            "record of 256 steps are further episodes of the same expert, which seeds do not have.",
-            f"{TRAJECTORIES:,} trajectories from the page cache, with programs compiled before. *Seeds* are simulated, "
-            "*full* shards decoded. *First episodes* come from `Dataset.episode_batches`; *records* from "
-            "`Dataset.read`, whole ones of 256 steps, of which the first episode counts here. The *reference* returns "
-            "such records with every array copied, without an observation. *Lanes* plays random actions with "
-            "observations, and reads nothing.",
+            extrapolation(found[0]),
+            f"The first {TRAJECTORIES:,} trajectories of each folder, from the page cache, with programs compiled "
+            "before. *Seeds* are simulated, *full* shards decoded. *First episodes* come from "
+            "`Dataset.episode_batches`; *records* from `Dataset.read`, whole ones of 256 steps, of which the first "
+            "episode counts here. The *reference* returns such records with every array copied, without an "
+            "observation. *Lanes* plays random actions with observations, and reads nothing.",
             f"Bytes per trajectory: those of *{RELEASED}* are {RECORD_STEPS} times the bytes of a transition in its 1M "
             f"split of this size; those of `full`, `resume` and `witness` {RECORD_STEPS} times what storage.md "
             f"measured in a split of the default procedure; those of `seed` are of the first {TRAJECTORIES:,} "
             "trajectories here, trivial ones included. All but `seed` keep whole records.",
-            f"![Bytes per trajectory on a logarithmic axis: released data, and our densities]({PLOT})",
+            f"![Bytes per trajectory of {found[0]['size']} on a logarithmic axis: released data, and our densities]"
+            f"({PLOT})",
         ],
         plots={PLOT: partial(draw, kept)},
         reference=versions,
-    )  # fmt: skip
+    )
+
+
+def files_of(found: Sequence[dict[str, Any]]) -> Table:
+    """Tabulate what the files hold and how large they are."""
+    head = ("size", "budget", "levels", "solved", "bytes", "per solved level, all others included")
+    rows = [
+        [one["size"], one["budget"], *(f"{one[name]:,}" for name in ("levels", "solved", "bytes")),
+         f"{one['bytes'] / one['solved']:.1f}"]
+        for one in found
+    ]  # fmt: skip
+    return Table(head, rows, "Files")
+
+
+def columns_of(found: Sequence[dict[str, Any]]) -> Table:
+    """Tabulate the bytes of each column, largest first."""
+    names = sorted(found[0]["columns"], key=lambda name: -found[0]["columns"][name])
+    head = ("column", *(f"{what} of {one['size']}" for one in found for what in ("bytes", "per solved level")))
+    of = lambda one, name: one["columns"].get(name, 0)
+    rows = [
+        [name, *(text for one in found for text in (f"{of(one, name):,}", f"{of(one, name) / one['solved']:.2f}"))]
+        for name in names
+    ]
+    return Table(head, rows, "Columns")
+
+
+def densities_of(found: Sequence[dict[str, Any]]) -> Table:
+    """Tabulate the bytes of a trajectory in every density."""
+    sizes = [one["per_trajectory"] for one in found]
+    share = lambda each, name: f"{each[name]:,.0f} ({each[name] / each[RELEASED]:.2%})"
+    rows = [[name, *(share(each, name) for each in sizes)] for name in sizes[0]]
+    return Table(("stored as", *(one["size"] for one in found)), rows, "Bytes per trajectory, and of released data's")
+
+
+def rates_of(found: Sequence[dict[str, Any]]) -> Table:
+    """Tabulate what each way to read reaches."""
+    rows = []
+    for one in found:
+        top = one["rates"]["Lanes"]["transitions"]
+        for name, rate in one["rates"].items():
+            trajectories = f"{rate['trajectories']:,.0f}" if "trajectories" in rate else "-"
+            rows.append([one["size"], name, f"{rate['transitions']:,.0f}", trajectories,
+                         f"{rate['transitions'] / top:.3f}"])  # fmt: skip
+    title = f"First episodes in random batches of {BATCH}, with {OBSERVATION} observations; per second of CPU time"
+    return Table(("size", "read from", "transitions/s", "trajectories/s", "against Lanes"), rows, title)
+
+
+def extrapolation(one: Mapping[str, Any]) -> str:
+    """Say what a dataset as large as the released one would take."""
+    per_level = one["bytes"] / one["solved"]
+    return (
+        f"At {per_level:.1f} bytes per solved level, {PUBLISHED_LEVELS:,} solved levels of {one['size']} would take "
+        f"{PUBLISHED_LEVELS * per_level / 1e6:,.0f} MB, where the {PUBLISHED_LEVELS:,} of the released dataset, of "
+        f"three sizes, take {PUBLISHED_BYTES / 1e9:,.0f} GB. Seeds keep first episodes; what follows in a released "
+        "record of 256 steps are further episodes of the same expert, which seeds do not have."
+    )
 
 
 def stored(seeds: Path) -> dict[str, Any]:

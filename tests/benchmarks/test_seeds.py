@@ -17,7 +17,8 @@ def test_bytes_add_up_and_every_way_reads(tmp_path: Path) -> None:
     split, seeds = honest_split(tmp_path / "data", 32, 1), tmp_path / "levels.parquet"
     export_seed(split, None, seeds)
     args = parser("seeds").parse_args(["seeds", str(seeds), "--seconds", "0.1", "--without-reference"])
-    stored, rates = run(args).results
+    (stored,) = run(args).results
+    rates = stored["rates"]
     assert sum(stored["columns"].values()) == stored["bytes"] == seeds.stat().st_size
     names = ["released data", "`full`", "`resume`", "`witness`", "`seed`"]
     assert [*stored["per_trajectory"]] == names
