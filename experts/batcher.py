@@ -123,8 +123,12 @@ def blank(rows: Rows, width: int) -> Rows:
 def entered(rows: Rows, fresh: Rows, sources: Int[Array, " group"], slots: Int[Array, " group"]) -> Rows:
     """Copy the rows `sources` of `fresh` into `slots`, up to the first slot past the end.
 
-    One at a time, all arrays in one loop: a scatter of each array takes twice as long, to compile and to run.
+    On a CPU one at a time, all arrays in one loop: a scatter of each takes twice as long, to compile and to run.
     """
+    if jax.default_backend() != "cpu":
+        first = lambda old, new: old.at[slots].set(new[sources], mode="drop")
+        last = lambda old, new: old.at[..., slots].set(new[..., sources], mode="drop")
+        return by_axis(last, first, rows, fresh)
 
     def enter(number: Int[Array, ""], rows: Rows) -> Rows:
         source, slot = sources[number], slots[number]

@@ -13,13 +13,14 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache, cached_property, partial, update_wrapper
+from functools import cache, partial, update_wrapper
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import jax
 from jax import monitoring
+from jax._src import core
 from jax.core import Tracer
 from jax.experimental import serialize_executable
 from llvmlite import binding
@@ -27,16 +28,18 @@ from llvmlite import binding
 from levelproof.physics.codegen.compile import register, texts_in
 from levelproof.physics.codegen.kept import cache_is_on, key_by_sources, store, stored
 
+Options = Mapping[str, Any]
 # XLA's options for CPUs. Level 1 of its optimiser makes programs as fast as level 3 does, in four fifths of the time.
 # Its older code for fusions gives LLVM half as much to do, but slows down networks and the search. A program compiled
 # with other options may round otherwise.
-OPTIMISED = {"xla_backend_optimization_level": 1}
-OLDER_FUSIONS = OPTIMISED | {"xla_cpu_use_fusion_emitters": False}
-UNOPTIMISED = {"xla_backend_optimization_level": 0}
+OPTIMISED: Options = {"xla_backend_optimization_level": 1}
+OLDER_FUSIONS = {**OPTIMISED, "xla_cpu_use_fusion_emitters": False}
+UNOPTIMISED: Options = {"xla_backend_optimization_level": 0}
+FOR_TESTS = {**OLDER_FUSIONS, **UNOPTIMISED}  # what `jax_disable_most_optimizations` asks for
 SOURCES = [Path(__file__).parents[1] / room for room in ("physics", "levelgen", "experts")]
 LOADED = "/jax/core/compile/levelproof_load"  # event that counts as compiling, as JAX's own do
 COMPILED = "/jax/compilation_cache/cache_misses"  # JAX's event when it has compiled a program and written it
-TRACING = threading.Lock()  # Python's part of compiling gains nothing from threads, and shares what it caches
+TRACING = threading.RLock()  # Python's part of compiling gains nothing from threads, and shares what it caches
 T = TypeVar("T")
 
 
@@ -52,35 +55,37 @@ class Call(NamedTuple):
 class StoredProgram(Generic[T]):
     """A jitted function, whose programs are stored beside JAX's compiled ones.
 
-    Called on a GPU, on several devices or without a folder for the cache, it is `jax.jit` alone. Called within another
-    program, it is compiled with that program's options.
+    On a GPU, on several devices or without a folder for the cache, it is `jax.jit` with XLA's options. A call that JAX
+    traces becomes a part of the program that is traced, with that program's options.
     """
 
     __name__: str  # the function's
 
-    def __init__(self, function: Callable[..., T], options: Mapping[str, Any] = OPTIMISED, **settings: Any) -> None:
-        self.function, self.options, self._settings = function, options, settings
+    def __init__(self, function: Callable[..., T], options: Options = OPTIMISED, **settings: Any) -> None:
+        self.function, self._given, self._settings = function, options, settings
         self._signature, self._programs = inspect.signature(function), dict[Call, Any]()
+        self._jitted: dict[str, Any] = {}
         self._locks: dict[Call, threading.Lock] = {}
         names = settings.get("static_argnames", ())
         self._static = {names} if isinstance(names, str) else set(names)
         update_wrapper(self, function)
 
-    @cached_property
-    def program(self) -> Any:
-        """The jitted function; made on first use, because `jax.default_backend` starts the backend."""
-        options = dict(self.options) if jax.default_backend() == "cpu" else None
-        return jax.jit(self.function, compiler_options=options, **self._settings)
+    @property
+    def options(self) -> Options:
+        """XLA's options for a CPU."""
+        return FOR_TESTS if jax.config.values["jax_disable_most_optimizations"] else self._given
 
-    @cached_property
-    def _part(self) -> Any:
-        """The jitted function as a part of another program, which JAX allows no options of its own."""
-        return jax.jit(self.function, **self._settings)
+    @property
+    def program(self) -> Any:
+        """The jitted function."""
+        options = None if _tracing() or jax.default_backend() != "cpu" else dict(self.options)  # JAX allows parts none
+        make = partial(jax.jit, self.function, compiler_options=options, **self._settings)
+        return self._jitted.get(repr(options)) or self._jitted.setdefault(repr(options), make())
 
     def __call__(self, *args: Any, **kwargs: Any) -> T:
         given, call = self._call(args, kwargs)
         if call is None:
-            return (self._part if _traced(given) else self.program)(*args, **kwargs)
+            return self.program(*args, **kwargs)
         return self._ready(call, args, kwargs)(*given)
 
     def prepare(self, *args: Any, **kwargs: Any) -> None:
@@ -101,6 +106,10 @@ class StoredProgram(Generic[T]):
         """Lower as `jax.jit` does: arguments may be shapes."""
         return self.program.lower(*args, **kwargs)
 
+    def forget(self) -> None:
+        """Drop the programs that this process holds, which take memory maps; the next calls load them again."""
+        self._programs.clear()
+
     def count(self) -> int:
         """Return how many programs this process has made or loaded."""
         return len(self._programs) or self.program._cache_size()
@@ -110,9 +119,9 @@ class StoredProgram(Generic[T]):
         bound = self._bound(args, kwargs)
         static = tuple(value for name, value in bound.arguments.items() if name in self._static)
         given = [value for name, value in bound.arguments.items() if name not in self._static]
-        if _traced(given) or not _alone() or not cache_is_on():
-            return given, None
         leaves, tree = jax.tree.flatten(given)
+        if _tracing() or any(isinstance(x, Tracer) for x in leaves) or not _alone() or not cache_is_on():
+            return given, None
         return given, Call(static, tree, tuple(map(_type_of, leaves)), _settings())
 
     def _bound(self, args: Any, kwargs: Any) -> inspect.BoundArguments:
@@ -146,7 +155,7 @@ class StoredProgram(Generic[T]):
             return lowered.compile()
         text = lowered.as_text()
         # The text leaves out arguments that nothing reads, but a loaded program checks the shapes of all
-        described = f"{text} {call.tree} {call.types} {self.options} {_machine()}"
+        described = f"{text} {call.tree} {call.types} {call.settings} {self.options} {_machine()}"
         place = "program " + hashlib.sha256(described.encode()).hexdigest()
         if program := _load(place, call):
             store(key, place.encode())
@@ -162,13 +171,14 @@ class StoredProgram(Generic[T]):
 def jit_stored(**settings: Any) -> Callable[[Callable[..., T]], StoredProgram[T]]:
     """Return a decorator that makes functions `StoredProgram`; settings are those of `jax.jit`.
 
-    For programs in which much of a job's time goes into a network or an archive: training and the search.
+    For programs in which much of a job's time goes into XLA's code: networks, archives, copies of large arrays.
     """
     return partial(StoredProgram, **settings)  # pyright: ignore[reportReturnType]
 
 
 def jit_sooner(**settings: Any) -> Callable[[Callable[..., T]], StoredProgram[T]]:
-    """Return a decorator as `jit_stored` does, for functions whose time goes into physics, or that run briefly.
+    """Return a decorator as `jit_stored` does, for functions whose time goes into physics, or of which a job needs few
+    calls.
 
     XLA compiles them for CPUs in about half the time. They run no slower: physics is our own machine code.
     """
@@ -176,12 +186,11 @@ def jit_sooner(**settings: Any) -> Callable[[Callable[..., T]], StoredProgram[T]
 
 
 def jit_quickly(**settings: Any) -> Callable[[Callable[..., T]], StoredProgram[T]]:
-    """Return a decorator as `jit_stored` does, for functions that run too briefly to repay optimisation.
+    """Return a decorator as `jit_sooner` does, for functions that only lay arrays out and multiply no floats.
 
     XLA compiles them for CPUs without optimising. It then rounds every product before adding to it, where the optimiser
     may merge a multiplication and an addition into one operation. So a function with products of floats may change its
-    bits: use this only for functions without any (tests/pipeline/jobs/test_programs.py). Physics is our own machine
-    code, which stays optimised.
+    bits: use this only for functions without any (tests/pipeline/jobs/test_programs.py).
     """
     return partial(StoredProgram, options=UNOPTIMISED, **settings)  # pyright: ignore[reportReturnType]
 
@@ -228,9 +237,9 @@ def _load(place: str, call: Call) -> Any:
     return program
 
 
-def _traced(given: Any) -> bool:
-    """Whether JAX is tracing another program, of which this call is a part."""
-    return any(isinstance(x, Tracer) for x in jax.tree.leaves(given))
+def _tracing() -> bool:
+    """Whether JAX is tracing another program."""
+    return not core.trace_state_clean()
 
 
 def _alone() -> bool:

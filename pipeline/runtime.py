@@ -94,7 +94,15 @@ def prepare_jax(
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     share_compiling()
-    gc.freeze()  # garbage collection skips what the imports made: tracing makes much, and the collector runs often
+
+
+def spare_imports() -> None:
+    """Exempt what this process's imports have made from garbage collection, once.
+
+    Tracing makes the collector run often, and it would look at all of that each time.
+    """
+    if not gc.get_freeze_count():
+        gc.freeze()
 
 
 def remove_damaged(folder: Path) -> None:

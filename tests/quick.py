@@ -12,12 +12,12 @@ from typing import Any
 import jax
 from jax._src import compiler
 
-from levelproof.levelgen.programs import UNOPTIMISED
+from levelproof.levelgen.programs import UNOPTIMISED, StoredProgram
 
 FAST_COMPILING = "jax_disable_most_optimizations"  # a setting of JAX
 # XLA's older code for fusions takes LLVM half as long as what replaces it. JAX has no setting for such options, and the
 # environment's would count for all modules of tests.
-FASTER: dict[str, Any] = UNOPTIMISED | {"xla_cpu_use_fusion_emitters": False}
+FASTER = {"xla_cpu_use_fusion_emitters": False}
 # Tests that compile many programs and run each briefly. Records are kernels of our own, whose bits do not depend on
 # XLA. No test here compares other bits with those of a process that optimises.
 BRIEF = (
@@ -49,7 +49,7 @@ BRIEF = (
     "tests/test_docs",
 )
 MAX_MAPS = 40_000
-jit_once = partial(jax.jit, compiler_options=UNOPTIMISED)
+jit_once = partial(jax.jit, compiler_options=dict(UNOPTIMISED))
 options_of = compiler.get_compile_options  # JAX's own
 
 
@@ -59,8 +59,8 @@ def is_brief(nodeid: str) -> bool:
 
 
 def fast_options(*given: Any, env_options_overrides: dict[str, Any] | None = None, **named: Any) -> Any:
-    """Return the options of a program, as JAX does, with those that make compiling faster in place of its own."""
-    overrides: dict[str, Any] = (env_options_overrides or {}) | FASTER
+    """Return the options of a program, as JAX does, with those that make compiling faster."""
+    overrides = FASTER | dict(env_options_overrides or {})
     return options_of(*given, env_options_overrides=overrides, **named)
 
 
@@ -83,6 +83,9 @@ def make_room() -> None:
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MAX_MAPS:
         jax.clear_caches()
+        modules = [module for name, module in sys.modules.items() if name.startswith("levelproof.")]
+        for program in {each for module in modules for each in vars(module).values() if type(each) is StoredProgram}:
+            program.forget()
 
 
 if __name__ == "__main__":

@@ -46,10 +46,7 @@ class Program(NamedTuple):
 
 
 def programs_of(pool: Pool, size: Size) -> list[Program]:
-    """Return the programs that most jobs of this size use, those that take longest to compile first.
-
-    Except that `advance` comes second: only one thread traces at a time, and this takes two seconds.
-    """
+    """Return the programs that most jobs of this size use, roughly those that take longest to compile first."""
     trains = pool.procedure.stop.rule != Rule.NONE
     programs = searching(pool, size) + (training(pool, size) if trains else []) + judging(pool, size, trains)
     rank = {function: number for number, function in enumerate(LONGEST)}
@@ -138,7 +135,8 @@ def ids_of(count: int) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct((count,), np.int32)
 
 
-# By seconds of compiling, measured for levels of size s; all others take less
+# By seconds of compiling, measured for levels of size s; all others take less. But one thread traces at a time, and to
+# trace `advance` takes two seconds, in which XLA can compile what was traced before.
 LONGEST = (
     explore.explore_rounds,
     advance,

@@ -8,7 +8,7 @@ from typing import Any
 from levelproof.configs.schema import JobConfig
 from levelproof.pipeline.jobs.likeness import Program, mismatch
 from levelproof.pipeline.jobs.schedule import Order, Round
-from levelproof.pipeline.runtime import own_core, prepare_jax
+from levelproof.pipeline.runtime import own_core, prepare_jax, spare_imports
 from levelproof.pipeline.store.leases import serve
 
 
@@ -33,6 +33,7 @@ class WorkerActor:
         from levelproof.pipeline.jobs.ahead import Ahead
         from levelproof.pipeline.jobs.workers import worker_for
 
+        spare_imports()
         serve(split, writer)
         self._worker, self._working, self._rounds = worker_for(job, split), False, 0
         self._previous_handler = signal.signal(signal.SIGTERM, self._on_sigterm)

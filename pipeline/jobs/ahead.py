@@ -1,4 +1,4 @@
-"""Compiling a job's programs before its first level: one worker of a machine compiles each, the slowest one first."""
+"""Compiling a job's programs before its first level: one worker of a machine compiles each, the slow ones first."""
 
 import hashlib
 import time

@@ -9,7 +9,7 @@ from levelproof.configs.schema import JobConfig
 from levelproof.pipeline.jobs.choice import MANY, MAX_THREADS, workers_here
 from levelproof.pipeline.jobs.progress import STOPPING, Board
 from levelproof.pipeline.jobs.schedule import ROUND, Round, Scheduler, Settle
-from levelproof.pipeline.runtime import NO_GPU, jax_sees_a_gpu, own_cores, prepare_jax
+from levelproof.pipeline.runtime import NO_GPU, jax_sees_a_gpu, own_cores, prepare_jax, spare_imports
 from levelproof.pipeline.stopping import Stop
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board
     from levelproof.pipeline.jobs.ahead import Ahead
     from levelproof.pipeline.jobs.workers import worker_for
 
+    spare_imports()
     with stop.heeded():
         workers = {Handle(number): worker_for(job, split) for number in range(count)}
         first = next(iter(workers.values()))

@@ -55,10 +55,9 @@ def claims(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.slow
-def test_levels_compile_no_program_that_was_compiled_ahead(
-    job: JobConfig, pool: Pool, programs: list[Program], claims: Path
-) -> None:
+def test_levels_compile_no_program_that_was_compiled_ahead(job: JobConfig, pool: Pool, claims: Path) -> None:
     one, other = Ahead(job, pool), Ahead(job, pool)
+    programs = [*one._programs.values()]
     counts = [(other if turn % 2 else one).compile_next() for turn in range(len(programs))]
     assert counts == [(done, len(programs)) for done in range(1, len(programs) + 1)]
     assert one.compile_next() is None

@@ -1,4 +1,4 @@
-"""What is known of the sealed levels is what a job finds out. XLA optimises here, as it did when they were labelled."""
+"""What is known of the sealed levels is what a job finds out. XLA optimises here, as it does in a job."""
 
 from pathlib import Path
 
