@@ -123,7 +123,8 @@ def blank(rows: Rows, width: int) -> Rows:
 def entered(rows: Rows, fresh: Rows, sources: Int[Array, " group"], slots: Int[Array, " group"]) -> Rows:
     """Copy the rows `sources` of `fresh` into `slots`, up to the first slot past the end.
 
-    On a CPU one at a time, all arrays in one loop: a scatter of each takes twice as long, to compile and to run.
+    On a CPU, rows are copied one after another, each in all arrays: a scatter into each array takes twice as long to
+    compile, and longer to run.
     """
     if jax.default_backend() != "cpu":
         first = lambda old, new: old.at[slots].set(new[sources], mode="drop")

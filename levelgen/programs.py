@@ -35,7 +35,7 @@ Options = Mapping[str, Any]
 OPTIMISED: Options = {"xla_backend_optimization_level": 1}
 OLDER_FUSIONS = {**OPTIMISED, "xla_cpu_use_fusion_emitters": False}
 UNOPTIMISED: Options = {"xla_backend_optimization_level": 0}
-FOR_TESTS = {**OLDER_FUSIONS, **UNOPTIMISED}  # what `jax_disable_most_optimizations` asks for
+SOONEST = {**OLDER_FUSIONS, **UNOPTIMISED}  # in place of all others while `jax_disable_most_optimizations` is on
 SOURCES = [Path(__file__).parents[1] / room for room in ("physics", "levelgen", "experts")]
 LOADED = "/jax/core/compile/levelproof_load"  # event that counts as compiling, as JAX's own do
 COMPILED = "/jax/compilation_cache/cache_misses"  # JAX's event when it has compiled a program and written it
@@ -73,14 +73,15 @@ class StoredProgram(Generic[T]):
     @property
     def options(self) -> Options:
         """XLA's options for a CPU."""
-        return FOR_TESTS if jax.config.values["jax_disable_most_optimizations"] else self._given
+        return SOONEST if jax.config.values["jax_disable_most_optimizations"] else self._given
 
     @property
     def program(self) -> Any:
-        """The jitted function."""
-        options = None if _tracing() or jax.default_backend() != "cpu" else dict(self.options)  # JAX allows parts none
-        make = partial(jax.jit, self.function, compiler_options=options, **self._settings)
-        return self._jitted.get(repr(options)) or self._jitted.setdefault(repr(options), make())
+        """The jitted function; without options on other devices, and as a part of a program, where JAX allows none."""
+        options = None if _tracing() or jax.default_backend() != "cpu" else dict(self.options)
+        if (key := repr(options)) not in self._jitted:
+            self._jitted[key] = jax.jit(self.function, compiler_options=options, **self._settings)
+        return self._jitted[key]
 
     def __call__(self, *args: Any, **kwargs: Any) -> T:
         given, call = self._call(args, kwargs)
@@ -177,10 +178,9 @@ def jit_stored(**settings: Any) -> Callable[[Callable[..., T]], StoredProgram[T]
 
 
 def jit_sooner(**settings: Any) -> Callable[[Callable[..., T]], StoredProgram[T]]:
-    """Return a decorator as `jit_stored` does, for functions whose time goes into physics, or of which a job needs few
-    calls.
+    """Return a decorator as `jit_stored` does, for functions that mostly run physics, or that a job calls rarely.
 
-    XLA compiles them for CPUs in about half the time. They run no slower: physics is our own machine code.
+    XLA compiles them for CPUs in about half the time. They run hardly slower: physics is our own machine code.
     """
     return partial(StoredProgram, options=OLDER_FUSIONS, **settings)  # pyright: ignore[reportReturnType]
 

@@ -12,12 +12,9 @@ from typing import Any
 import jax
 from jax._src import compiler
 
-from levelproof.levelgen.programs import UNOPTIMISED, StoredProgram
+from levelproof.levelgen.programs import SOONEST, UNOPTIMISED, StoredProgram
 
 FAST_COMPILING = "jax_disable_most_optimizations"  # a setting of JAX
-# XLA's older code for fusions takes LLVM half as long as what replaces it. JAX has no setting for such options, and the
-# environment's would count for all modules of tests.
-FASTER = {"xla_cpu_use_fusion_emitters": False}
 # Tests that compile many programs and run each briefly. Records are kernels of our own, whose bits do not depend on
 # XLA. No test here compares other bits with those of a process that optimises.
 BRIEF = (
@@ -48,7 +45,7 @@ BRIEF = (
     "tests/test_commands",
     "tests/test_docs",
 )
-MAX_MAPS = 40_000
+MAX_MAPS = 40_000  # memory maps of a process, beyond which it drops its programs
 jit_once = partial(jax.jit, compiler_options=dict(UNOPTIMISED))
 options_of = compiler.get_compile_options  # JAX's own
 
@@ -59,8 +56,11 @@ def is_brief(nodeid: str) -> bool:
 
 
 def fast_options(*given: Any, env_options_overrides: dict[str, Any] | None = None, **named: Any) -> Any:
-    """Return the options of a program, as JAX does, with those that make compiling faster."""
-    overrides = FASTER | dict(env_options_overrides or {})
+    """Return the options of a program, as JAX does, with those that make compiling fastest.
+
+    JAX has no setting for all of them, and the environment's would count for all modules of tests.
+    """
+    overrides = SOONEST | dict(env_options_overrides or {})
     return options_of(*given, env_options_overrides=overrides, **named)
 
 

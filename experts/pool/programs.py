@@ -32,7 +32,7 @@ class Program(NamedTuple):
 
     function: StoredProgram
     call: Callable[[], tuple[tuple[Any, ...], dict[str, Any]]]  # makes the positional and named arguments
-    stage: str = ""  # stage whose slots it serves; distinguishes programs of one function
+    stage: str = ""  # what distinguishes programs of one function, such as the stage whose slots it serves
 
     @property
     def name(self) -> str:

@@ -4,10 +4,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from levelproof.experts.batcher import Batcher, Entrant, Submission
+from levelproof.experts.batcher import Batcher, Entrant, Submission, entered
 
 WIDTH = 3
 
@@ -91,3 +92,16 @@ def test_every_level_begins_once() -> None:
         slots.at.clear()
         slots.fill(begin_and_count)
     assert calls == [[0, 1, 2, 3], [4, 5, 5, 5]]
+
+
+def test_accelerators_copy_the_same_rows_into_slots(monkeypatch: pytest.MonkeyPatch) -> None:
+    ids = jnp.arange(4, dtype=jnp.int32)
+    rows = lambda: Counters({"mass": jnp.zeros((2, WIDTH))}, jnp.zeros(WIDTH, jnp.int32), jnp.full(WIDTH, 5))
+    fresh = Counters({"mass": jnp.tile(10.0 + ids, (2, 1))}, ids, jnp.zeros(4, jnp.int32))
+    sources, slots = np.array([2, 3, 0, 0]), np.array([1, 0, WIDTH, WIDTH])
+    on_cpu = entered(rows(), fresh, sources, slots)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    elsewhere = entered.function(rows(), fresh, sources, slots)
+    jax.tree.map(np.testing.assert_array_equal, on_cpu, elsewhere)
+    assert on_cpu.level_ids.tolist() == [3, 2, 0]
+    assert on_cpu.count.tolist() == [0, 0, 5]
