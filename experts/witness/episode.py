@@ -4,31 +4,36 @@ A record whose later episodes have the actions of the first one repeats it, bit 
 the level's first state. So the first episode is simulated, and the rest is copied.
 """
 
+import heapq
+from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Int, UInt32
 
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.witness.resume import checksum, paths_of
 from levelproof.experts.witness.witness import record_of
-from levelproof.levelgen.batching import blocks, take
+from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import controls
+from levelproof.levelgen.task.fresh import renewed
 from levelproof.levelgen.task.observe.kinds import ObservationType, changing_features, constant_features, join
 from levelproof.levelgen.task.rules import TaskParams, TaskState
 from levelproof.physics.buffers import zeros_of
 from levelproof.physics.types import Manifold
 
-# Lanes of a block, which ends with its longest episode: with more, lanes of few episodes would wait for the last one;
-# with fewer, a step of the engine would cost more per lane.
+# A lane that ends its episode begins another, so that none waits for the longest one. Few episodes are not enough for
+# that in many lanes, and in few lanes a step of the engine costs more per lane.
 FEW_LANES, MANY_LANES = 16, 128
-MANY = 512  # episodes from which on blocks have MANY_LANES, because neighbours in length differ little
-LENGTHS = (64, RECORD_STEPS)  # env steps that a block has room for: one program for each
+MANY = 512  # episodes from which on there are MANY_LANES
+AT_ONCE = 1024  # episodes that are played together
+STEPS = 128  # most env steps of each lane in one call of the program
 
 
 class PlayedEpisodes(NamedTuple):
@@ -40,22 +45,31 @@ class PlayedEpisodes(NamedTuple):
     reaches: Bool[np.ndarray, " level"]  # whether the episode ends at its last step and not before, at the goal
 
 
-class _PlayedBlock(NamedTuple):
-    """Episodes of a block; what lies after the last step of an episode has no meaning."""
+class _Moves(NamedTuple):
+    """What to play: arrays [row, ...] of env steps, or [step, lane, ...], where zeros stand for lanes that wait."""
 
-    rows: tuple[dict[str, Array], Any]  # fields by path, and what the observation has of the state, [step, lane, ...]
-    constant: Float[Array, "lane feature"]  # what the observation has of the level
-    checksum: UInt32[Array, " lane"]
-    reaches: Bool[Array, " lane"]
+    episode: Int[Any, "..."]
+    step: Int[Any, "..."]  # since the episode's start
+    first: Bool[Any, "..."]  # whether the episode begins with it
+    last: Bool[Any, "..."]
+    action: Int[Any, "... 6"]
 
 
-class _PlayingBlock(NamedTuple):
-    step: Int[Array, ""]
+class _Playing(NamedTuple):
+    """What lanes carry from one step to the next."""
+
+    level: Level  # of the episode that each lane plays; its `state` is None
     now: TaskState
-    manifold: Any
-    end: TaskState  # before the last action of the episode, once there
-    reaches: Bool[Array, " lane"]
-    rows: Any
+    manifold: Any  # of the physics step that led there, zero at an episode's start; None if no field needs it
+
+
+class _Rows(NamedTuple):
+    """What was played: arrays [row, ...] of env steps, or [step, lane, ...]."""
+
+    fields: dict[str, Any]  # by path
+    changing: Any  # `changing_features` of the observation; None if none is requested
+    checksum: Any  # of the state before the action
+    right: Any  # whether the step ends its episode, and at the goal, if it is the last one, and only then
 
 
 def play_episodes(
@@ -66,7 +80,7 @@ def play_episodes(
     fields: frozenset[str],
     observation: ObservationType | None = None,
 ) -> PlayedEpisodes:
-    """Play first episodes, those of similar length side by side.
+    """Play first episodes side by side.
 
     Args:
         level: levels, level axis last.
@@ -76,86 +90,123 @@ def play_episodes(
         fields: paths of `Record` to return; anything else is not kept.
         observation: type of the observation to return; None: none.
     """
-    count, first, total = len(steps), np.cumsum(steps) - steps, int(steps.sum())
-    size = MANY_LANES if count >= MANY else FEW_LANES
-    order = np.argsort(steps, kind="stable")[np.concatenate([*blocks(count, size)])]
-    ordered = take((level, steps.astype(np.int32)), order)
-    sums, reaches = np.zeros(count, np.uint32), np.zeros(count, bool)
-    rows: Any = None
+    ends = np.cumsum(steps)
+    first, rows = ends - steps, None
     constants: list[np.ndarray] = []
-    for start in range(0, len(order), size):
-        mine = order[start : start + size]
-        room = next(length for length in LENGTHS if length >= steps[mine[-1]])
-        its_level, its_steps = take(ordered, slice(start, start + size))
-        its_action = take(action[:room], mine)
-        made: _PlayedBlock = jax.device_get(_play_block(its_level, its_action, its_steps, rules, fields, observation))
-        sums[mine], reaches[mine] = made.checksum, made.reaches
-        if rows is None:
-            rows = jax.tree.map(lambda x: np.empty((total, *x.shape[2:]), x.dtype), made.rows)
-        constants.append(np.asarray(made.constant))
-        mine = mine[: count - start]  # without padding
-        lane, step = _each_step(steps[mine])
-        row, place = first[mine][lane] + step, step * size + lane
-        for to, source in zip(jax.tree.leaves(rows), jax.tree.leaves(made.rows), strict=True):
-            to[row] = source.reshape(-1, *source.shape[2:]).take(place, 0)
-    made_fields, shown = rows
+    for begin in range(0, len(steps), AT_ONCE):
+        some = slice(begin, begin + AT_ONCE)
+        mine = slice(first[begin], ends[some][-1])
+        levels, moves = _table(take(level, some)), _moves_of(action[..., some], steps[some])
+        for where, played in _play_together(levels, moves, rules, fields, observation):
+            if rows is None:
+                rows = jax.tree.map(lambda x: np.empty((ends[-1], *x.shape[1:]), x.dtype), played)
+            for to, source in zip(jax.tree.leaves(rows), jax.tree.leaves(played), strict=True):
+                to[mine][where] = source
+        constants.append(np.asarray(_constant_features(levels, observation))[: len(steps[some])])
+    assert rows is not None, "there is at least one episode of at least one step"
+    shown = rows.changing
     if observation is not None:
-        constant = np.concatenate(constants)[np.argsort(order[:count])]  # in the given order
-        shown = join(observation, level.size, constant, shown, _each_step(steps)[0])
-    return PlayedEpisodes(made_fields, shown, sums, reaches)
+        episode = np.repeat(np.arange(len(steps)), steps)
+        shown = join(observation, level.size, np.concatenate(constants), shown, episode)
+    sums = rows.checksum[first] + rows.checksum[ends - 1]
+    return PlayedEpisodes(rows.fields, shown, sums, np.logical_and.reduceat(rows.right, first))
 
 
-def _each_step(steps: Int[np.ndarray, " level"]) -> tuple[Int[np.ndarray, " row"], Int[np.ndarray, " row"]]:
-    """Return the episode and the step of each row of episodes of these lengths, one episode after another."""
-    episode = np.repeat(np.arange(len(steps)), steps)
-    return episode, np.arange(len(episode)) - (np.cumsum(steps) - steps)[episode]
+def _table(level: Level) -> Level:
+    """Copy levels to the device, padded, so that one program serves any number of them."""
+    count = len(level)
+    return jax.device_put(take(level, np.minimum(np.arange(AT_ONCE if count >= MANY else MANY), count - 1)))
 
 
-@partial(jax.jit, static_argnames=("rules", "fields", "observation"))
-def _play_block(
-    level: Level,
-    action: Int[Array, "step 6 lane"],
-    steps: Int[Array, " lane"],
+def _moves_of(action: Int[np.ndarray, "256 6 level"], steps: Int[np.ndarray, " level"]) -> _Moves:
+    """Return the env steps of episodes, one episode after another."""
+    episode = np.repeat(np.arange(len(steps), dtype=np.int32), steps)
+    step = np.arange(len(episode), dtype=np.int32) - (np.cumsum(steps) - steps).astype(np.int32)[episode]
+    return _Moves(episode, step, step == 0, step == steps[episode] - 1, action[step, :, episode])
+
+
+def _play_together(
+    levels: Level, moves: _Moves, rules: TaskParams, fields: frozenset[str], observation: ObservationType | None
+) -> Iterator[tuple[Int[np.ndarray, " row"], _Rows]]:
+    """Play episodes; yield some rows and which ones they are, until all are played."""
+    lanes = MANY_LANES if len(levels) > MANY else FEW_LANES
+    begin, lane = (x[moves.episode] for x in _places(moves.step[moves.last] + 1, lanes))
+    time = begin + moves.step
+    playing = _waiting(levels, lanes, fields)
+    for start in range(0, int(time.max()) + 1, STEPS):
+        where = np.flatnonzero((time >= start) & (time < start + STEPS))
+        at, mine = time[where] - start, lane[where]
+        turn = jax.tree.map(lambda x: np.zeros((STEPS, lanes, *x.shape[1:]), x.dtype), moves)
+        for to, source in zip(turn, moves, strict=True):
+            to[at, mine] = source[where]
+        playing, played = _play_turn(levels, playing, turn, at.max() + 1, rules, fields, observation)
+        of_rows = lambda x, place=at * lanes + mine: x.reshape(-1, *x.shape[2:]).take(place, 0)
+        yield where, jax.tree.map(of_rows, jax.device_get(played))
+
+
+def _places(
+    steps: Int[np.ndarray, " level"], lanes: int
+) -> tuple[Int[np.ndarray, " level"], Int[np.ndarray, " level"]]:
+    """Return when each episode begins and in which lane: the longest first, in the lane that is free first."""
+    begin, lane = np.zeros_like(steps), np.zeros_like(steps)
+    free = [(0, number) for number in range(lanes)]  # a heap: when each lane is free
+    for episode in np.argsort(-steps, kind="stable").tolist():
+        begin[episode], lane[episode] = free[0]
+        heapq.heapreplace(free, (int(begin[episode] + steps[episode]), free[0][1]))
+    return begin, lane
+
+
+@partial(jax.jit, static_argnames=("lanes", "fields"))
+def _waiting(levels: Level, lanes: int, fields: frozenset[str]) -> _Playing:
+    """Return lanes that have not begun an episode."""
+    return jax.tree.map(jnp.zeros_like, _first_of(take(levels, slice(lanes)), fields))
+
+
+def _first_of(level: Level, fields: frozenset[str]) -> _Playing:
+    """Return episodes that begin in levels."""
+    contacts = None
+    if any(name.startswith("manifold/") for name in fields):
+        contacts = zeros_of(Manifold, level.size, len(level))
+    return _Playing(replace(level, state=None), task.reset(level), contacts)  # pyright: ignore[reportArgumentType]
+
+
+_constant_features = jax.jit(lambda level, kind: constant_features(kind, level).T, static_argnums=1)
+
+
+@partial(jax.jit, static_argnames=("rules", "fields", "observation"), donate_argnames="playing")
+def _play_turn(
+    levels: Level,
+    playing: _Playing,
+    moves: _Moves,
+    count: Int[Array, ""],
     rules: TaskParams,
     fields: frozenset[str],
     observation: ObservationType | None,
-) -> _PlayedBlock:
-    with_contacts = any(name.startswith("manifold/") for name in fields)
-    action = action.astype(jnp.int32)
+) -> tuple[_Playing, _Rows]:
+    """Play `count` env steps of each lane; rows after them have no meaning."""
 
-    def row(now: TaskState, manifold: Any, taken: Array, outcome: Any) -> Any:
+    def act(lanes: _Playing, move: _Moves) -> tuple[_Playing, _Rows]:
+        taken = move.action.T.astype(jnp.int32)
+        begun = lambda episode: _first_of(take(levels, episode), fields)
+        level, now, manifold = renewed(move.first, move.episode, begun, lanes)
+        driven, with_contacts = controls(level, taken), manifold is not None
+        after, outcome, _, contacts = task.advance_driven(level, now, driven, rules, with_contacts)
         made = paths_of(record_of(level, now, manifold, taken, outcome))
         kept = {name: x for name, x in made.items() if name in fields}
         shown = None if observation is None else changing_features(observation, level, now.state)
-        return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), (kept, shown))
+        kept, shown = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), (kept, shown))
+        sums = checksum(jax.tree.map(lambda x: x[None], now), move.step[None])[0]
+        right = (outcome.done == move.last) & (outcome.goal == move.last)
+        return _Playing(level, after, contacts), _Rows(kept, shown, sums, right)
 
-    def act(playing: _PlayingBlock) -> _PlayingBlock:
-        step, now = playing.step, playing.now
-        after, outcome, _, contacts = task.advance_driven(
-            level, now, controls(level, action[step]), rules, with_contacts
-        )
-        last = step == steps - 1
-        right = (outcome.done == last) & (outcome.goal == last)
+    def turn(step: Int[Array, ""], carry: tuple[_Playing, _Rows]) -> tuple[_Playing, _Rows]:
+        lanes, made = act(carry[0], jax.tree.map(lambda x: x[step], moves))
         put = lambda x, new: jax.lax.dynamic_update_index_in_dim(x, new, step, 0)
-        rows = jax.tree.map(put, playing.rows, row(now, playing.manifold, action[step], outcome))
-        end = jax.tree.map(lambda x, before: jnp.where(last, x, before), now, playing.end)
-        return _PlayingBlock(step + 1, after, contacts, end, playing.reaches & (right | (step >= steps)), rows)
+        return lanes, jax.tree.map(put, carry[1], made)
 
-    start = task.reset(level)
-    contacts = zeros_of(Manifold, level.size, len(steps)) if with_contacts else None
-    shapes = jax.eval_shape(lambda: row(start, contacts, action[0], task.step(level, start, action[0], rules)[1]))
-    empty = jax.tree.map(lambda x: jnp.zeros((len(action), *x.shape), x.dtype), shapes)
-    begun = _PlayingBlock(jnp.int32(0), start, contacts, start, jnp.ones(len(steps), bool), empty)
-    over = jax.lax.while_loop(lambda playing: playing.step < steps.max(), act, begun)
-    sums, constant = _checksum(start, over.end, steps), constant_features(observation, level)
-    return _PlayedBlock(over.rows, constant.T, sums, over.reaches)
-
-
-def _checksum(start: TaskState, end: TaskState, steps: Any) -> Any:
-    """Checksum the first state of an episode and the one before its last action, without a time axis."""
-    row = steps.astype(np.int32)[None]
-    sums = [checksum(jax.tree.map(lambda x: x[None], state), at)[0] for state, at in ((start, row * 0), (end, row - 1))]
-    return sums[0] + sums[1]
+    shapes = jax.eval_shape(act, playing, jax.tree.map(lambda x: x[0], moves))[1]
+    empty = jax.tree.map(lambda x: jnp.zeros((STEPS, *x.shape), x.dtype), shapes)
+    return jax.lax.fori_loop(0, count, turn, (playing, empty))
 
 
 def checksum_of(states: TaskState, steps: Int[np.ndarray, " level"]) -> UInt32[np.ndarray, " level"]:
@@ -165,10 +216,11 @@ def checksum_of(states: TaskState, steps: Int[np.ndarray, " level"]) -> UInt32[n
         states: of the records, [256, ..., level].
         steps: lengths of the first episodes, env steps.
     """
-    lanes = np.arange(len(steps))
-    start = jax.tree.map(lambda x: np.asarray(x)[0], states)
-    end = jax.tree.map(lambda x: np.moveaxis(np.moveaxis(np.asarray(x), -1, 1)[steps - 1, lanes], 0, -1), states)
-    return _checksum(start, end, steps)
+    lanes, total = np.arange(len(steps)), np.zeros(len(steps), np.uint32)
+    for row in (np.zeros_like(steps), steps - 1):
+        at_row = lambda x, row=row: np.moveaxis(np.moveaxis(np.asarray(x), -1, 1)[row, lanes], 0, -1)[None]
+        total += checksum(jax.tree.map(at_row, states), row[None])[0]
+    return total
 
 
 def repeat_episodes(rows: np.ndarray, steps: Int[np.ndarray, " level"]) -> np.ndarray:

@@ -35,7 +35,7 @@ from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.named import open_shard
 from levelproof.pipeline.words import many
 
-EPISODES_AT_ONCE = 1024  # read together for batches of episodes: many lanes of similar length side by side
+EPISODES_AT_ONCE = 1024  # read together for batches of episodes, so that many lanes are busy
 OPEN_SHARDS = 256  # shards whose indices are cached
 ALWAYS_FIELDS = ("record/action", "record/reward", "record/done", "record/goal")
 
