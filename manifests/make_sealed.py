@@ -1,4 +1,4 @@
-"""Write what experts do on the sealed levels to pipeline/learn/sealed.json. See README.md here.
+"""Add what experts do on the sealed levels to pipeline/learn/sealed.json. See README.md here.
 
 python manifests/make_sealed.py sealed
 """
@@ -19,17 +19,29 @@ COLUMNS = ["level_id", "label", "success_rate", "budget"]
 
 
 def main(folder: Path) -> None:
-    sizes = {}
+    """Add every split of all sealed levels in a folder of splits; what is known of other budgets stays.
+
+    The labels of a size are those of its largest budget.
+    """
+    path = Path(sealed.__file__).with_name(sealed.KNOWN)
+    sizes = json.loads(path.read_text())["sizes"]
     for size in SIZES:
-        tables = [require_manifest(split, COLUMNS).table.sort_by("level_id") for split in folder.glob(f"*/{size}")]
-        whole = [table for table in tables if np.array_equal(table["level_id"].to_numpy(), np.array(sealed.SEALED))]
-        if not whole:
-            continue
-        whole.sort(key=lambda table: parse_count(table["budget"][0].as_py(), "budget"))
-        text = lambda table: "".join(sealed.SUCCESSES[each] for each in successes_of(table, ATTEMPTS))
-        labels = "".join(sealed.LETTERS[label] for label in whole[-1]["label"].to_pylist())
-        sizes[size] = {"labels": labels, "successes": {table["budget"][0].as_py(): text(table) for table in whole}}
-    Path(sealed.__file__).with_name(sealed.KNOWN).write_text(json.dumps({"sizes": sizes}, indent=1) + "\n")
+        known = sizes.setdefault(size, {"labels": "", "successes": {}})
+        for split in folder.glob(f"*/{size}"):
+            table = require_manifest(split, COLUMNS).table.sort_by("level_id")
+            if not np.array_equal(table["level_id"].to_numpy(), np.array(sealed.SEALED)):
+                continue
+            budget = table["budget"][0].as_py()
+            known["successes"][budget] = "".join(sealed.SUCCESSES[each] for each in successes_of(table, ATTEMPTS))
+            if max(known["successes"], key=steps_of) == budget:
+                known["labels"] = "".join(sealed.LETTERS[label] for label in table["label"].to_pylist())
+        known["successes"] = dict(sorted(known["successes"].items(), key=lambda item: steps_of(item[0])))
+    path.write_text(json.dumps({"sizes": sizes}, indent=1) + "\n")
+
+
+def steps_of(budget: str) -> int:
+    """Return the env steps of a budget."""
+    return parse_count(budget, "budget")
 
 
 if __name__ == "__main__":
