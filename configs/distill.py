@@ -8,13 +8,13 @@ from levelproof.experts.imitation import ImitationConfig
 from levelproof.experts.networks.over_levels import NetworkConfig
 from levelproof.physics.bounds import require
 
-# Other than those of cloning, because most runs start from a policy
+# Differ from the defaults of cloning because most runs start from a policy
 TRAIN = ImitationConfig(updates=2000, learning_rate=2e-4, warmup=100, average=0.99)
 
 
 @dataclass(frozen=True)
 class DistillConfig:
-    """Which states of the learner teachers label, and how it learns from them."""
+    """Choice of the learner's states that teachers label, and training on these labels."""
 
     where: str = "label = 'solved'"  # SQL condition on the manifest's columns that selects levels
     start: str = ""  # folder of a policy to continue training, with its network; empty: from scratch

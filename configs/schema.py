@@ -133,7 +133,7 @@ class JobConfig:
 
     @property
     def levels_per_unit(self) -> int:
-        """Number of levels in a work unit; if units are timed, only until the first one has ended."""
+        """Number of levels in a work unit; if units are sized by duration, only until the first one ends."""
         if self.unit is not None:
             return self.unit
         bodies = size_of(self.size).bodies
@@ -203,7 +203,7 @@ class ImportConfig(JobConfig):
 
 @dataclass(frozen=True)
 class GrowConfig(JobConfig):
-    """The settings of a job of `levelproof grow`: `level_files` is a seed file, or a folder of some."""
+    """The settings of a job of `levelproof grow`: `level_files` is a seed file, or a folder of seed files."""
 
     grown: str = "{}"  # the `results` of the seed files, as JSON
 
@@ -216,7 +216,7 @@ class GrowConfig(JobConfig):
 
     @property
     def levels_per_unit(self) -> int:
-        """Number of levels in a work unit: more than of trained levels, because records take milliseconds."""
+        """Number of levels in a work unit: more than of trained levels, because a record grows in milliseconds."""
         return GROWN_UNIT * super().levels_per_unit
 
     @property

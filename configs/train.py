@@ -44,7 +44,7 @@ class TrainConfig:
         require(self, ("seed",), 0, 2**31 - 1)
         if not self.levels:
             raise ValueError(f"levels is empty: choose one of {', '.join(CURRICULA)}, a split or level files")
-        room = int((1 - self.replay.full_enough) * self.replay.capacity)
+        room = self.replay.capacity - self.replay.enough
         if self.levels == "evolve" and self.evolve.children > room:
             raise ValueError(
                 f"evolve.children is {self.evolve.children}: it must not exceed {room}, the slots of replay.capacity = "

@@ -41,7 +41,7 @@ def advantages(
 ) -> Float[Array, "time ..."]:
     """Estimate generalised advantages (Schulman et al. 2016, arXiv:1506.02438).
 
-    An episode's end counts as its last state's value being 0: add that value to the reward if only time ran out.
+    The value after an episode's end is 0: if only the time limit ended it, add that of the state reached to the reward.
     """
 
     def back(carry, now):

@@ -86,6 +86,6 @@ def entropy(logits: Float[Array, "logit lane"], live: Bool[Array, "6 lane"]) -> 
 def divergence(
     logits: Float[Array, "logit lane"], other: Float[Array, "logit lane"], live: Bool[Array, "6 lane"]
 ) -> Float[Array, " lane"]:
-    """Return the Kullback-Leibler divergence of `other` from a policy, KL(policy || other), of live entries, nats."""
+    """Return the Kullback-Leibler divergence of a policy from `other`, KL(policy || other), over live entries, nats."""
     entries = zip(_entries(logits), _entries(other), live, strict=True)
     return sum(jnp.where(counts, (jnp.exp(p) * (p - q)).sum(0), 0.0) for p, q, counts in entries)  # type: ignore[return-value]

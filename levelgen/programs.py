@@ -31,7 +31,7 @@ from levelproof.physics.codegen.kept import cache_is_on, key_by_sources, store, 
 Options = Mapping[str, Any]
 # XLA's options for CPUs. Level 1 of its optimiser makes programs as fast as level 3 does, in four fifths of the time.
 # Its older code for fusions gives LLVM half as much to do, but slows down networks and the search. A program compiled
-# with other options may round otherwise.
+# with other options may round differently.
 OPTIMISED: Options = {"xla_backend_optimization_level": 1}
 OLDER_FUSIONS = {**OPTIMISED, "xla_cpu_use_fusion_emitters": False}
 UNOPTIMISED: Options = {"xla_backend_optimization_level": 0}
@@ -112,7 +112,7 @@ class StoredProgram(Generic[T]):
         self._programs.clear()
 
     def count(self) -> int:
-        """Return how many programs this process has made or loaded."""
+        """Return the number of programs that this process has compiled or loaded."""
         return len(self._programs) or self.program._cache_size()
 
     def _call(self, args: Any, kwargs: Any) -> tuple[list[Any], Call | None]:
@@ -196,7 +196,7 @@ def jit_quickly(**settings: Any) -> Callable[[Callable[..., T]], StoredProgram[T
 
 
 class _FreshlyCompiled(threading.local):
-    """How many programs this thread has compiled."""
+    """Number of programs that this thread has compiled."""
 
     count = 0
 

@@ -1,5 +1,6 @@
 """Settings of training one policy over many levels."""
 
+import math
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -110,6 +111,11 @@ class ReplayConfig:
         require(self, ("capacity",), 1, 2**20)
         if self.share == 1:
             raise ValueError("share is 1: set it below 1, or no new level is ever played")
+
+    @property
+    def enough(self) -> int:
+        """Number of attempted levels from which replay starts."""
+        return math.ceil(round(self.full_enough * self.capacity, 6))  # 0.9 * 10 is a little more than 9
 
 
 @dataclass(frozen=True)

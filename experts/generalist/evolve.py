@@ -76,7 +76,7 @@ def _breed(
     """Add a generation of children to the buffer, in numpy on the host, unless too many of the last one still wait."""
     buffer: ReplayBuffer = jax.tree.map(np.asarray, now.buffer)
     capacity = replaying.capacity
-    room = (1 - replaying.full_enough) * capacity - waiting(buffer).sum()
+    room = capacity - replaying.enough - waiting(buffer).sum()
     if not buffer.cumulative[-1] or config.children > room:
         return now
     weight = np.diff(buffer.cumulative, prepend=0)
@@ -92,8 +92,8 @@ def _breed(
         after[..., free] = value
         return jnp.asarray(after)
 
-    values = names, -np.inf, -np.inf, 0, buffer.cumulative[free]
-    buffer = ReplayBuffer(*(put(x, value) for x, value in zip(buffer, values, strict=True)))
+    values = {"level_index": names, "score": -np.inf, "best": -np.inf, "age": 0}
+    buffer = buffer._replace(**{name: put(getattr(buffer, name), value) for name, value in values.items()})
     levels = jax.tree.map(lambda x, child: put(x, child[..., born]), now.levels, children)
     return Population(with_weights(replaying, buffer), levels, now.generation + 1)
 

@@ -20,7 +20,7 @@ class Learnable(NamedTuple):
 
 
 def by_level(candidates: Int[Array, " candidate"], *counts: Int[Array, " candidate"]) -> tuple[Array, ...]:
-    """Add up the counts of copies, which small tables give: the luckiest copies of few levels would take all places.
+    """Sum the counts of duplicates, which small tables give: else the luckiest ones would fill all places.
 
     Returns:
         Distinct levels, padded to as many as there are candidates, and their counts, which are 0 where padded.

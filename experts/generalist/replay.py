@@ -116,5 +116,5 @@ def with_weights(config: ReplayConfig, buffer: ReplayBuffer) -> ReplayBuffer:
     parts = jnp.where(attempted, jnp.stack([rank ** (-1 / config.temperature), ages]), 0.0)
     parts /= jnp.maximum(parts.sum(1, keepdims=True), 1e-9)
     weight = (2.0**30 * ((1 - config.staleness) * parts[0] + config.staleness * parts[1])).astype(jnp.int32)
-    enough = attempted.sum() >= config.full_enough * config.capacity
+    enough = attempted.sum() >= config.enough
     return buffer._replace(cumulative=jnp.where(enough, jnp.cumsum(weight), 0))

@@ -89,7 +89,7 @@ class Labels(NamedTuple):
 
 
 class Recalled(NamedTuple):
-    """A witness to vary, in lanes that share out over its states."""
+    """A witness to vary, in equally many lanes per state."""
 
     action: Int8[Array, "256 6 state"]
     shift: Int[Array, " lane"]  # env steps by which the lane runs ahead
@@ -243,7 +243,7 @@ class KnownExperts(NamedTuple):
 
 
 def no_experts(levels: int) -> KnownExperts:
-    """Return experts for none of so many levels."""
+    """Return a `KnownExperts` without an expert for any of `levels` levels."""
     return KnownExperts(None, None, np.full(levels, -1))
 
 

@@ -1,6 +1,6 @@
 """Proximal policy optimisation of one policy over many levels, on one or more cores; reads no files.
 
-Lanes are shared out over the cores of a mesh. Each core acts and computes gradients in its own lanes; averaged, they
+Lanes are distributed over the cores of a mesh. Each core acts and computes gradients in its own lanes; averaged, they
 change one set of weights, of which every core has a copy.
 """
 
@@ -98,7 +98,7 @@ def programs_of(recipe: TrainingRecipe, table: Table, start: VariableDict | None
         recipe: what is trained, and how.
         table: the levels; gives shapes only.
         start: parameters of the policy that training starts from; None: from scratch. Gives shapes only.
-        cores: devices to share the lanes out over.
+        cores: number of devices that share the lanes.
     """
     leaves, tree = jax.tree.flatten((table, start))
     shapes = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves)
@@ -294,7 +294,7 @@ def _key(recipe: TrainingRecipe, update: Array) -> Key[Array, ""]:
 
 
 def _measure(recipe: TrainingRecipe, learner: Learner, table: Table) -> Learner:
-    """Have the curriculum measure levels, shared out over the cores, by the policy as it acts now."""
+    """Let the curriculum measure levels by the policy as it acts now, distributed over the cores."""
     curriculum = recipe.curriculum
     assert curriculum.measure
 

@@ -65,7 +65,7 @@ class Policy:
         `experts.policy.log_probability` and `entropy` take them, with `levelgen.task.actions.action_mask`.
 
         Args:
-            level: each lane's level; its `state` is not read.
+            level: each lane's level; of its `state`, only the scenery is read, which never moves.
             state: each lane's world, or its episode.
 
         Raises:
@@ -126,7 +126,7 @@ def load_policy(folder: str | os.PathLike[str]) -> Policy:
                 f"The policy {path} has format {config['format']}, but this levelproof reads format {FORMAT}: "
                 "update levelproof."
             )
-        shape = config["network"]
+        shape, origin = config["network"], config["origin"]
         network = NetworkConfig(**shape | {"kind": PolicyKind(shape["kind"])})
         size = None if config["size"] is None else size_of(config["size"])
         wanted = jax.eval_shape(lambda: initial_policy(key_of_seed(0), network, size or size_of("m")))
@@ -137,7 +137,7 @@ def load_policy(folder: str | os.PathLike[str]) -> Policy:
         if isinstance(error, PolicyError):
             raise
         raise PolicyError(f"The policy in {path} is damaged ({error}): make or copy it again.") from None
-    return Policy(network, params, size, config["origin"])
+    return Policy(network, params, size, origin)
 
 
 def policy_folder(name: str | os.PathLike[str]) -> Path:

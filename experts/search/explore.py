@@ -127,7 +127,7 @@ def explore_round(search: Search, ring: Arena, ends: StopLimits, config: SearchC
 
 
 def under_way(search: Search, ends: StopLimits) -> Bool[Array, " level"]:
-    """Return for which levels the search continues.
+    """Mark the levels whose search continues.
 
     These have no success, have env steps left, are not at a rung with too few cells, and have lately come nearer to
     the goal. A level with few cells is hopeless: its episodes end at once, or its actuators move little. And the

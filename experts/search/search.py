@@ -34,8 +34,8 @@ class SearchResult(NamedTuple):
     """Results of some levels, level first."""
 
     success: Success  # length 0: none
-    env_steps: Int[Array, " level"]  # of all lanes, including those that shorten a success
-    varied: Int[Array, " level"]  # env steps of variations
+    env_steps: Int[Array, " level"]  # of Go-Explore, in all lanes
+    varied: Int[Array, " level"]  # env steps of variations, and of shortening a success
     cells: Int[Array, " level"]  # cells reached, each of the width that cells had then
     grew: Int[Array, " level"]  # env steps when the last cell was reached
 
@@ -121,7 +121,7 @@ class Searching:
             levels, level_ids = take(job.levels, some), job.level_ids[some]
             shorter = jax.device_get(shorten(levels, level_ids, given, self._scaled.endless, self._rules))
             results.success.action[some], results.success.length[some] = shorter.success
-            results.env_steps[some] += shorter.env_steps  # a level that pads its block counts once
+            results.varied[some] += shorter.env_steps  # a level that pads its block counts once
         return results
 
     def _explore(self) -> None:

@@ -28,7 +28,7 @@ class LevelConstants(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Samples of an update, or of one of its minibatches; targets and advantages from GAE."""
+    """Samples of an update or of one of its minibatches; advantages are from GAE."""
 
     moving: Float[Array, "dynamic sample"]
     action: Float[Array, "6 sample"]

@@ -69,7 +69,7 @@ class _Rows(NamedTuple):
     fields: dict[str, Any]  # by path
     changing: Any  # `changing_features` of the observation; None if none is requested
     checksum: Any  # of the state before the action
-    right: Any  # whether the step ends its episode, and at the goal, if it is the last one, and only then
+    right: Any  # whether the step is as recorded: the last one ends its episode at the goal, no other one ends it
 
 
 def play_episodes(

@@ -37,7 +37,7 @@ def find(
     """Find the first success of a rollout that fits a record, if any.
 
     Args:
-        recent: actions, the rollout's last.
+        recent: latest actions, ending with those of the rollout.
         goal: whether each step of the rollout reached the goal.
         timestep: env steps of the episode before each step.
     """

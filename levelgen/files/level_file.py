@@ -70,6 +70,8 @@ def read_level_file(path: str | os.PathLike[str]) -> LevelFile:
 def write_level_file(file: LevelFile, path: str | os.PathLike[str]) -> None:
     """Write a level as JSON that Kinetix and its editor open; the file appears whole or not at all.
 
+    Files do not hold the rule `faithful_padding`: readers get the default, which is the reference's physics.
+
     Raises:
         LevelFileError: a file cannot hold the level: it does not have exactly one lane, starts with contacts, or has
             motors that run by themselves.

@@ -95,7 +95,7 @@ class Distribution:
         require(self, [name for name in names if name.endswith("_chance")], 0, 1)
         require(self, names, 0)
         require(self, [field.name for field in fields(self) if field.type is int], 0, 10**9)
-        require(self, ("proposals", "min_half_side", "min_radius"), 0, above=True)
+        require(self, ("proposals", "polygon_connections", "min_half_side", "min_radius"), 0, above=True)
         self._check_sums()
         for low, high in (
             ("min_motor_speed", "max_motor_speed"),
@@ -115,7 +115,7 @@ class Distribution:
             )
         for names in (("connected_weight", "free_weight", "empty_weight"), CONTROL_WEIGHTS):
             if not any(getattr(self, name) for name in names):
-                raise ValueError(f"{names[-1]} is 0: one of {names[0]}, {names[1]} and {names[2]} must be more")
+                raise ValueError(f"{names[-1]} is 0: set at least one of {names[0]}, {names[1]} and {names[2]} above 0")
 
     def _check_shapes(self) -> None:
         for name, factor in (("max_size", 1.0), ("goal_size_factor", self.goal_size_factor)):

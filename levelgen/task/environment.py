@@ -180,7 +180,7 @@ class Environment:
     def reset(
         self, key: Key[Array, ""], params: EnvParams | None = None, override_reset_state: EnvState | None = None
     ) -> tuple[Any, EnvState]:
-        """Start an episode: return its observation and state."""
+        """Start an episode, in `override_reset_state` if given: return its observation and state."""
         levels, index, override = self._restart(key, params, override_reset_state, 0)
         return single(self._reset_lanes)(levels, index, (override, jnp.asarray(index)))
 
@@ -196,7 +196,8 @@ class Environment:
         """Take one env step: return observation, state, reward, done, info.
 
         If the episode ended and the environment resets itself, the observation and the state are those of the
-        next episode's start; reward and info are always those of the step.
+        next episode's start; reward and info are always those of the step. `override_reset_state` is
+        not read if the environment does not reset itself.
 
         Entries of `info`:
             GoalR: whether green touched blue.

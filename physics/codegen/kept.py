@@ -40,7 +40,7 @@ def cached_by_sources(request: str, make: Callable[[], bytes], folders: Sequence
 
 
 def key_by_sources(request: str, folders: Sequence[Path]) -> str | None:
-    """Return the key of `request`, these sources and the library versions; None if a source has changed meanwhile."""
+    """Return the key of `request`, these sources and library versions; None if a source has changed since the start."""
     digests, changes = zip(*map(_sources, folders), strict=True)
     if max(changes) >= BEGAN:
         return None

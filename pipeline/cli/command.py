@@ -24,7 +24,7 @@ def add_json(parser: argparse._ActionsContainer) -> None:
 
 
 def parted(words: Collection[str]) -> tuple[list[Path], list[str]]:
-    """Part a command's words into splits and settings; a word with "=" is a split only if it exists."""
+    """Separate a command's arguments into splits and settings; one with "=" is a split only if it exists."""
     # Unlike Path.exists, os.path.exists does not raise for a word that is too long for a path, such as a list of ids
     settings = [word for word in words if "=" in word and not os.path.exists(word)]
     return [Path(word) for word in words if word not in settings], settings

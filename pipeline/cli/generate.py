@@ -52,5 +52,9 @@ def _help(parser: argparse.ArgumentParser) -> str:
     settings = {setting.name: setting for setting in every_setting()}
     entries = ((settings[name].override, settings[name].text) for name in COMMON)
     common = "\n".join(listed(entries, shutil.get_terminal_size().columns, INDENT))
-    parser.epilog = f"settings and their defaults (all of them: levelproof settings):\n{common}\n\n{parser.epilog}"
-    return argparse.ArgumentParser.format_help(parser)
+    examples = parser.epilog
+    parser.epilog = f"settings and their defaults (all of them: levelproof settings):\n{common}\n\n{examples}"
+    try:
+        return argparse.ArgumentParser.format_help(parser)
+    finally:
+        parser.epilog = examples

@@ -60,7 +60,7 @@ def _run(argv: Sequence[str] | None) -> int:
 
 
 def _taken(arguments: argparse.Namespace, unknown: list[str]) -> list[str]:
-    """Take arguments that follow an option, which argparse leaves over; return those that the command does not have."""
+    """Assign positional arguments that argparse leaves over because they follow an option; return the unknown ones."""
     if any(word.startswith("-") for word in unknown):
         return unknown
     for name in ("words", "settings"):

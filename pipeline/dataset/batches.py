@@ -98,7 +98,7 @@ def batches_of(
     """Iterate over the batches of epochs in an order.
 
     Other arguments as `Batches`; `prefetch` None: two loads per core. Else one load returns at most half the batches
-    that may be in memory, so that the next load can begin before they are used up.
+    that may be in memory, so that the next load begins before they are used up.
     """
     if epochs is not None and epochs < 0:
         raise UserError(f"epochs is {epochs}: it must be at least 0, or None for endless batches.")
@@ -111,12 +111,13 @@ def batches_of(
 
 def _position_in(start: Any, settings: Mapping[str, Any]) -> int:
     try:
-        position = start["position"]
+        if type(position := start["position"]) is not int or position < 0:
+            raise ValueError
         saved = {RENAMED.get(name, name): value for name, value in dict(start["of"]).items()}
         differing = [name for name in settings if saved[name] != settings[name]]
     except (KeyError, TypeError, ValueError):
         raise UserError("The start is not a state of batches: pass what their state() returned.") from None
-    if differing or type(position) is not int or position < 0:
+    if differing:
         changes = ", ".join(f"{name} was {saved[name]}, now {settings[name]}" for name in differing)
         raise UserError(f"The start was saved with other settings ({changes}): use the same ones.")
     return position

@@ -53,7 +53,7 @@ def open(
     goal. Reads the manifest now, trajectories on demand.
 
     Args:
-        path: path or URL of the split, such as `data/1M/s`, or of a seed file or a folder of some (docs/seeds.md).
+        path: path or URL of the split, such as `data/1M/s`, or of seed files: one, or a folder (docs/seeds.md).
         where: SQL condition on the manifest's columns, such as `label = 'solved' AND steps_to_goal < 64`; None: all.
         columns: manifest columns to include in `Dataset.manifest`, besides those that are always read.
         validation: share of all levels, 0 to 1, that belongs to `subset="validation"`.

@@ -63,8 +63,8 @@ class TrajectorySource:
                 f"A forked process cannot {what} with JAX: pass the DataLoader multiprocessing_context='spawn'{way}."
             )
         chosen = np.asarray(items, np.int64)
-        if not ((chosen >= 0) & (chosen < len(self))).all():
-            raise IndexError(f"There is no item {chosen.max()}: the source has {len(self)}.")
+        if len(wrong := chosen[(chosen < 0) | (chosen >= len(self))]):
+            raise IndexError(f"There is no item {wrong[0]}: the source has {len(self)}.")
         which, first = self._windows.locate(chosen)
         batch = self._data.read(self._indices[which], length, first, fields, observation)
         return [_element(batch, i) for i in range(len(chosen))]

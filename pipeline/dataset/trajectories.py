@@ -119,8 +119,10 @@ class TrajectoryRows:
             UserError: an index does not exist.
             Failure: as `gather`.
         """
-        if not indices.size or indices.min() < 0 or indices.max() >= len(self):
-            raise UserError(f"There are no trajectories {indices.tolist()}: use indices from 0 to {len(self) - 1}.")
+        if not indices.size:
+            raise UserError("No trajectories to read: pass at least one index.")
+        if len(wrong := indices[(indices < 0) | (indices >= len(self))]):
+            raise UserError(f"There is no trajectory {wrong[0]}: use indices from 0 to {len(self) - 1}.")
         while True:
             table = self.table
             try:

@@ -26,10 +26,10 @@ SETTINGS = ("density", "key_every", "executor", "workers")
 
 
 def grow(source: Path, out: Path, settings: Sequence[str], console: Console) -> Exit:
-    """Grow seed files into the split `out`, or continue to.
+    """Grow seed files into the split `out`, or continue an earlier run.
 
     Args:
-        source: a seed file, or a folder of some.
+        source: a seed file, or a folder of seed files.
         out: path of the split.
         settings: `NAME=VALUE` for names in SETTINGS.
         console: receives progress and messages.
@@ -47,7 +47,7 @@ def grow(source: Path, out: Path, settings: Sequence[str], console: Console) -> 
     if not is_seed(source):
         raise UserError(
             f"There is no seed file at {as_typed(source)}: name a file that `levelproof export SPLIT --format seed` "
-            "wrote, or a folder of some."
+            "wrote, or a folder of such files."
         )
     manifest = require_manifest(source, [])
     job = _job(source, out, settings, manifest.config or {})

@@ -70,8 +70,9 @@ def grow_unit(job: GrowConfig, split: Path, unit: WorkUnit) -> Summary:
         OSError: a write failed; nothing is committed.
     """
     source, left = Path(job.level_files), unit.only(set(unit.level_ids) - committed_levels(split, unit.name))
-    if left is None:
-        return Summary(0, 0, EnvSteps())
+    if left is None:  # an attempt committed them, and its worker died before it could say so
+        labels = read_manifest(source, ["label"], level_ids=list(unit.level_ids)).table.column("label")
+        return Summary(len(labels), labels.to_pylist().count(Label.SOLVED), EnvSteps(), fragment=unit.name)
     table = read_manifest(source, level_ids=list(left.level_ids)).table
     if lacking := {*left.level_ids} - {*table.column("level_id").to_pylist()}:
         raise SourceUnseen(

@@ -59,7 +59,7 @@ def _work(
         settle(round.outcomes)
 
     def begin(handle: Handle) -> Future[Round] | None:
-        """Let an idle worker go on, if it has levels or now gets some."""
+        """Let an idle worker continue if it has units, or gets some now."""
         order = scheduler.order(handle, time.monotonic())
         if not scheduler.workers[handle].units:
             return None

@@ -101,7 +101,7 @@ def writer_of(log: str, folder: Path, step: str, name: str, settings: Mapping[st
         UserError: a link has the name of the folder.
     """
     if folder.is_symlink():
-        raise UserError(f"{folder} is a link, but must be a folder")
+        raise UserError(f"{folder} is a link: replace it with a folder, or set log=none")
     return TensorBoardWriter(folder, step) if log == "tensorboard" else WandbWriter(folder, step, name, settings)
 
 

@@ -63,7 +63,7 @@ class Tally:
 
     @property
     def trained(self) -> int:
-        """Levels that are decided, committed or not."""
+        """Number of levels that are decided, committed or not."""
         return self.done + int(sum(levels for _, levels, _ in self.running.values()))
 
     @property

@@ -59,7 +59,7 @@ WITHOUT_EFFECT = "log", "played"  # settings that a continued run may change
 
 
 def clone(splits: Sequence[Path], config: CloneConfig, out: Path, console: Console) -> None:
-    """Train a policy on the witnesses of splits, or continue to; write it to `out`, and print where it is.
+    """Train a policy on the witnesses of splits, or continue a run; write it to `out`, and print where it is.
 
     Raises:
         UserError: a split is unusable or has sealed levels, `out` is unusable, in use or has another run, or a library

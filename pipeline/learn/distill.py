@@ -110,7 +110,7 @@ class Answers(NamedTuple):
 
 
 def distill(split: Path, config: DistillConfig, out: Path, console: Console) -> None:
-    """Train a policy on the labels of teachers, or continue to; write it to `out`, and print where it is.
+    """Train a policy on the labels of teachers, or continue a run; write it to `out`, and print where it is.
 
     Raises:
         UserError: the split, the policy to start from or settings are unusable; `out` is unusable, in use or has

@@ -60,7 +60,7 @@ WITHOUT_EFFECT = ("log", "cores")  # settings that a resumed run may change; the
 
 
 def train(config: TrainConfig, out: Path, console: Console) -> None:
-    """Train a policy, or continue to; write it to `out`, and print where it is.
+    """Train a policy, or continue a run; write it to `out`, and print where it is.
 
     Raises:
         UserError: levels, the policy to start from or settings are unusable; `out` is unusable, in use or has another

@@ -55,10 +55,10 @@ def levels_for(config: TrainConfig, tell: Callable[[str], None]) -> TrainingLeve
 
 def _require_enough(config: TrainConfig, starts: int) -> None:
     """Raise UserError if there are fewer levels, each start of one counted, than replay waits for."""
-    needed = config.replay.full_enough * config.replay.capacity
+    needed = config.replay.enough
     if config.choice == "replay" and starts < needed:
         raise UserError(
-            f"choice=replay starts once {needed:,.0f} levels have been attempted (replay.full_enough times "
+            f"choice=replay starts once {needed:,} levels have been attempted (replay.full_enough times "
             f"replay.capacity), but {config.levels} gives {starts:,}: set a smaller replay.capacity."
         )
 

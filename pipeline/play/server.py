@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event, Lock, Thread
 
 import numpy as np
 from websockets.datastructures import Headers
@@ -78,6 +78,7 @@ class PageConnection:
         self._connection, self._session = connection, session
         self._procedure, self._budget = procedure, budget
         self._stop, self._training = Event(), Thread()
+        self._lock = Lock()  # of the session: an edit must not come between a check of its level and the witness
 
     def run(self) -> None:
         """Answer requests until the page closes."""
@@ -98,7 +99,8 @@ class PageConnection:
             case "stop":
                 self._stop.set()
                 return {}
-        return self._session.answer(request)
+        with self._lock:
+            return self._session.answer(request)
 
     def _train(self) -> Message:
         """Start training an expert for the current level; edits made during training do not affect it."""
@@ -112,15 +114,22 @@ class PageConnection:
     def _report(self, file: LevelFile, stop: Event) -> None:
         try:
             for message in train_level(file, self._procedure, self._budget, stop):
-                if (witness := message.pop("witness", None)) is not None and file is self._session.file:
-                    self._session.solve(witness)
-                    message["film"] = self._session.film(witness)
+                if (witness := message.pop("witness", None)) is not None:
+                    message |= self._solved(file, witness)
                 self._send({"training": message})
         except ConnectionClosed:
             pass
         except Exception as error:  # only the page can show it: no caller waits for this thread
             with suppress(ConnectionClosed):
                 self._send({"training": {"stage": "failed", "reason": f"{type(error).__name__}: {error}"}})
+
+    def _solved(self, file: LevelFile, witness: np.ndarray) -> Message:
+        """Keep a witness of the level as it was when training began; return its film, or nothing after an edit."""
+        with self._lock:
+            if file is not self._session.file:
+                return {}
+            self._session.solve(witness)
+            return {"film": self._session.film(witness)}
 
     def _send(self, message: Message) -> None:
         self._connection.send(json.dumps(message))

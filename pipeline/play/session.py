@@ -119,7 +119,7 @@ class Session:
         return self._swap(self._redo, self._undo)
 
     def at(self, request: Message) -> Message:
-        """Indices of the bodies at a point, topmost first."""
+        """Return the indices of the bodies at a point, topmost first."""
         return {"bodies": bodies_at(self._file.level, float(request["x"]), float(request["y"]))}
 
     def empty(self, request: Message) -> Message:
@@ -140,13 +140,13 @@ class Session:
         }
 
     def play(self, _: Message) -> Message:
-        """Film of the witness."""
+        """Return a film of the witness."""
         if self._witness is None:
             raise UserError("There is no witness yet: reach the goal, or train an expert.")
         return self.film(self._witness)
 
     def attempt(self, _: Message) -> Message:
-        """Film of the policy's next attempt, which is a witness if it reaches the goal."""
+        """Play the policy's next attempt; return its film, and keep it as the witness if it reaches the goal."""
         if self._contender is None or not self._contender.policy.can_play(self._file.level.size):
             raise UserError("No policy plays this level: name one that does with `levelproof play --policy POLICY`.")
         one = self._file.level, np.zeros(1, np.int32), self._file.rules
@@ -269,7 +269,7 @@ def _padded(actions: np.ndarray) -> np.ndarray:
 
 
 def empty_file(size: str) -> LevelFile:
-    """An empty level of a size, with the default rules.
+    """Return an empty level of a size, with the default rules.
 
     Raises:
         UserError: no such size, or one without room for a goal.

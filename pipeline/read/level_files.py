@@ -1,5 +1,6 @@
 """Level files as a job's levels: listing those below a folder, and loading a level by its origin."""
 
+import shlex
 import socket
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -83,7 +84,7 @@ def _origin_of(path: Path, job: JobConfig) -> Origin:
     if other := _other_rules(file, job):
         raise LevelFileError(
             f"Cannot use the level file {path}: its rules differ from this command's. This labels it, separately "
-            f"from files with other rules: levelproof generate level_files={path} {' '.join(other)}"
+            f"from files with other rules: levelproof generate {shlex.quote(f'level_files={path}')} {' '.join(other)}"
         )
     return Origin(content_hashes(file.level)[0], str(path), size)
 

@@ -123,9 +123,9 @@ def require_plain(file: Path | IO[bytes], size: int) -> None:
 def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, KeptExpert]:
     """Load the experts of the split `job.continue_from` that can continue on these levels; all others start new.
 
-    An expert that solved its level starts new, because it ends the same with any larger budget; not so if experts use
-    their whole budget, or if the last evaluation alone solved the level. Whether the expert solved it follows from the
-    witness or, if the witness is from a search around the expert's own, from the expert's course.
+    An expert that solved its level starts new, because it would end the same with any larger budget. It continues if
+    experts use their whole budget, or if only the last evaluation solved the level. Whether the expert solved it
+    follows from the witness or, if the witness is from a search around the expert's own, from the expert's course.
 
     Raises:
         SourceUnseen: this process does not find that split.

@@ -120,7 +120,7 @@ def without_commits(split: Path, say: Callable[[str], None]) -> Iterator[None]:
 
 
 def is_written(split: Path, say: Callable[[str], None] = lambda _: None) -> bool:
-    """Whether a `levelproof generate` is writing to this split now; needs read access only.
+    """Whether a levelproof command is writing to this split now; needs read access only.
 
     Passes `say` the reason for a long wait, which happens only in a store.
     """

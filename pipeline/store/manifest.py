@@ -204,7 +204,7 @@ def read_manifest(
     """Read the manifest of a split, one row per level that was tried; empty if nothing is committed yet.
 
     Args:
-        split: the folder `{out}/{budget}/{size}`, or a seed file, or a folder of some.
+        split: the folder `{out}/{budget}/{size}`, or a seed file, or a folder of seed files.
         columns: columns to read (default: all); `level_id` is always included.
         level_ids: levels to read (default: all); fragments whose name excludes all of them are not opened.
         compact: return repetitive columns as dictionaries, which for millions of rows take a tenth of the memory.

@@ -1,7 +1,8 @@
 """Origins of levels that are not sampled from an id: a level file, a record of an imported folder, or a shard.
 
-They are in a shard once they have a witness, and in a seed file always. A level file's id is derived from its content
-hash, so its random streams do not depend on where the file lies. A record's id is its position in the folder.
+Such a level is in a shard once it has a witness, and in a seed file unless that was exported without levels. A level
+file's id is derived from its content hash, so its random streams do not depend on where the file lies. A record's id is
+its position in the folder.
 """
 
 import os

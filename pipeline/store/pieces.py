@@ -43,17 +43,17 @@ class PieceCache:
             if about.st_size > MAX_PIECE:
                 return None
             if time.time() - about.st_mtime > TOUCH_INTERVAL:
-                os.utime(path, follow_symlinks=False)
+                with suppress(OSError):  # missing, or the folder can only be read
+                    os.utime(path, follow_symlinks=False)
             if name in self._checked:
                 return os.pread(descriptor, last - first, first)
             data = os.pread(descriptor, about.st_size, 0)
-        except FileNotFoundError:  # another process has just removed it
-            return None
         finally:
             os.close(descriptor)
         piece, checksum = data[:-CHECKSUM], int.from_bytes(data[-CHECKSUM:], "little")
         if len(data) <= CHECKSUM or google_crc32c.value(piece) != checksum:
-            path.unlink(missing_ok=True)
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
             return None
         self._checked.add(name)
         return piece[first:last]
@@ -98,6 +98,6 @@ def make_room(folder: Path, most: int) -> None:
     for _, size, path in sorted(files):
         if total <= KEPT_SHARE * most:
             break
-        with suppress(FileNotFoundError):
+        with suppress(OSError):
             os.unlink(path)
         total -= size

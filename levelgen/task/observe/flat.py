@@ -90,7 +90,7 @@ def join_features(
     concatenate the pieces of `symbolic_flat`, feature by feature.
 
     Args:
-        size: of the levels.
+        size: size of the levels.
         constant: features of the levels.
         moving: features of the states.
         row_level: the level of each state.

@@ -62,7 +62,7 @@ def join(
 
     Args:
         kind: type of the observation.
-        size: of the levels.
+        size: size of the levels.
         constant: `constant_features` of the levels.
         changing: `changing_features` of the states, [row, ...].
         row_level: the level of each state.
@@ -79,7 +79,7 @@ def observe(
 
     Args:
         kind: what to return.
-        level: each lane's level; its `state` is not read.
+        level: each lane's level; of its `state`, only the pose of the scenery is read, and nothing with `constant`.
         state: each lane's world.
         constant: `constant_features(kind, level)`, if the caller has computed them, as once per rollout.
     """

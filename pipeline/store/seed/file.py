@@ -65,7 +65,7 @@ def file_of(source: Path, name: str) -> Path:
 
 
 def name_of_table(what: str, files: Sequence[Path]) -> str | None:
-    """Name a table of seed files for `store.mapped`; None: a file is behind a URL, or gone."""
+    """Name a table of seed files for `store.mapped`; None: a file is remote or missing."""
     states = [written(path) for path in files]
     return None if None in states else f"{what} of {[*zip(map(str, map(Path.absolute, files)), states, strict=True)]}"
 

@@ -25,8 +25,8 @@ from levelproof.pipeline.store.seed.columns import KEPT
 from levelproof.pipeline.store.seed.file import SeedFile, damaged_seed, read_seed, seed_files
 from levelproof.pipeline.store.seed.source import LevelSource
 
-# Manifest column -> columns of the seed file that it is derived from, besides `level_id`, which is always read
 IDENTITIES = ("content_hash", "signature")
+# Manifest column -> columns of the seed file that it is derived from, besides `level_id`, which is always read
 MADE_FROM: dict[str, tuple[str, ...]] = {
     **{name: (name,) for name in KEPT},
     **dict.fromkeys(IDENTITIES, ("content",)),
@@ -36,7 +36,13 @@ MADE_FROM: dict[str, tuple[str, ...]] = {
     "row": ("label",),
     **dict.fromkeys(("versions", "engine", "device"), ("made_with",)),
 }
-COSTS = ("env_steps", "evaluation_steps", "scout_steps", "search_steps", "episodes")  # 0: they stay behind
+COSTS = (
+    "env_steps",
+    "evaluation_steps",
+    "scout_steps",
+    "search_steps",
+    "episodes",
+)  # 0: left out
 Each = Callable[[pa.Table], pa.Table]
 
 

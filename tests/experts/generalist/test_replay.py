@@ -74,6 +74,14 @@ EVOLVING = ReplayConfig(capacity=32)
 EVOLVE = evolve(EvolveConfig(children=16), EVOLVING, sampler("s"), DEFAULT_RULES)
 
 
+@pytest.mark.parametrize(
+    ("share", "capacity", "enough"), [(0.9, 1000, 900), (0.9, 10, 9), (0.5, 5, 3), (0, 7, 0), (1, 7, 7)]
+)
+def test_share_of_slots_that_starts_replay_is_a_number_of_levels(share: float, capacity: int, enough: int) -> None:
+    """In floats, (1 - 0.9) * 1000 is less than 100."""
+    assert ReplayConfig(full_enough=share, capacity=capacity).enough == enough
+
+
 @pytest.mark.parametrize("temperature", [0.1, 1.0])
 def test_levels_without_an_attempt_are_never_replayed(temperature: float) -> None:
     """Their weight is exactly 0, however floats round; with all ages equal staleness counts for all alike."""

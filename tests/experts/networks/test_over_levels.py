@@ -161,9 +161,11 @@ def test_unusable_policies_are_refused(tmp_path: Path) -> None:
     levels = levelproof.sample_levels(np.arange(2), "m")
     with pytest.raises(levelproof.PolicyError, match="size s only, not m"):
         policy.logits(levels, levels.state)
-    (tmp_path / CONFIG).write_text((tmp_path / CONFIG).read_text().replace('"width": 16', '"width": 17'))
-    with pytest.raises(levelproof.PolicyError, match="damaged"):
-        levelproof.load_policy(tmp_path)
+    config = (tmp_path / CONFIG).read_text()
+    for change in ('"width": 16', '"width": 17'), ('"origin"', '"other"'):
+        (tmp_path / CONFIG).write_text(config.replace(*change))
+        with pytest.raises(levelproof.PolicyError, match="damaged"):
+            levelproof.load_policy(tmp_path)
     (tmp_path / WEIGHTS).unlink()
     with pytest.raises(levelproof.PolicyError, match="no policy"):
         levelproof.load_policy(tmp_path)

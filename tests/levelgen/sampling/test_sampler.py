@@ -253,14 +253,15 @@ def test_sampler_refuses_ids_out_of_range(level_id: int) -> None:
         ({"floor_red_chance": -0.1}, "floor_red_chance is -0.1: it must be between 0 and 1"),
         ({"hidden_penalty": -1.0}, "hidden_penalty is -1.0: it must be at least 0"),
         ({"proposals": 0}, "proposals is 0: it must be above 0"),
+        ({"polygon_connections": 0}, "polygon_connections is 0: it must be above 0"),
         ({"max_limit": float("nan")}, "max_limit is nan: it must be a finite number"),
         ({"max_motor_speed": 0.1}, "min_motor_speed is 0.4: it must be at most max_motor_speed, 0.1"),
         ({"connected_circle_chance": 2.0}, "connected_circle_chance is 2.0: it must be between 0 and 1"),
         ({"motor_only_weight": -1.0}, "motor_only_weight is -1.0: it must be at least 0"),
         (
             {"motor_only_weight": 0.0, "thruster_only_weight": 0.0, "motor_and_thruster_weight": 0.0},
-            "motor_and_thruster_weight is 0: one of motor_only_weight, thruster_only_weight and "
-            "motor_and_thruster_weight must be more",
+            "motor_and_thruster_weight is 0: set at least one of motor_only_weight, thruster_only_weight and "
+            "motor_and_thruster_weight above 0",
         ),
         ({"floor_blue_chance": 0.95}, "floor_red_chance is 0.08: the floor's chances add up to 1.03, over 1"),
         ({"max_size": 0.1}, "max_size is 0.1: shapes would be smaller than min_half_side or min_radius"),

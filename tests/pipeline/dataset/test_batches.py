@@ -77,8 +77,9 @@ def test_batches_reject_a_state_of_other_settings(data: Dataset) -> None:
     state = data.batches(8, **PLAIN).state()
     with pytest.raises(UserError, match="The start was saved with other settings \\(seed was 3, now 4\\)"):
         data.batches(8, start=state, observation=None, seed=4)
-    with pytest.raises(UserError, match="The start is not a state of batches"):
-        data.batches(8, start={"step": 3})
+    for no_state in {"step": 3}, state | {"position": -1}, state | {"position": "3"}:
+        with pytest.raises(UserError, match="The start is not a state of batches"):
+            data.batches(8, start=no_state, observation=None, seed=3)
 
 
 def test_batches_stop_their_threads_when_collected(data: Dataset) -> None:

@@ -236,8 +236,12 @@ def test_open_read_and_state_reject_invalid_arguments(split: Path, tmp_path: Pat
         open(split, validation=2)
     with pytest.raises(UserError, match="trajectories is in the subset validation: pass another validation= to open"):
         open(split, validation=0).batches(8, subset="validation")
-    for indices in ([999], [-1, 0], []):
-        with pytest.raises(UserError, match="There are no trajectories"):
+    for indices, sentence in (
+        ([0, 999], "no trajectory 999:"),
+        ([-1, 0], "no trajectory -1:"),
+        ([], "at least one index"),
+    ):
+        with pytest.raises(UserError, match=sentence):
             open(split).read(indices)
     for step in (256, -1):
         with pytest.raises(UserError, match=f"There are no steps {step} in a record"):

@@ -1,5 +1,6 @@
 """Piece cache: returns the bytes that were put or none, within its bound, whatever processes and disks do."""
 
+import errno
 import os
 from pathlib import Path
 
@@ -67,6 +68,21 @@ def test_piece_cache_removes_what_a_killed_process_left(tmp_path: Path) -> None:
     assert cache.read("name-0", 0, 1) is None
     cache.put("name-0", b"x")
     assert [path.name for path in tmp_path.iterdir()] == ["name-0"]
+
+
+def test_piece_cache_reads_a_folder_that_it_cannot_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    PieceCache(tmp_path, 400).put("name", b"piece")
+    os.utime(tmp_path / "name", (0, 0))
+    (tmp_path / "damaged").write_bytes(bytes(CHECKSUM + 1))
+
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(errno.EROFS, "read-only")
+
+    for module, name in (os, "utime"), (os, "unlink"), (Path, "unlink"):
+        monkeypatch.setattr(module, name, refuse)
+    cache = PieceCache(tmp_path, 400)
+    assert cache.read("name", 0, 5) == b"piece"
+    assert cache.read("damaged", 0, 1) is None
 
 
 def test_piece_cache_explains_an_unwritable_folder(tmp_path: Path) -> None:

@@ -231,6 +231,17 @@ def test_unit_whose_ends_were_left_out_is_committed_beside_what_it_had(split: Pa
     assert len(fragment_paths(out)) == 2
 
 
+def test_unit_that_was_committed_without_a_report_is_counted(seed: Path, tmp_path: Path) -> None:
+    """As if the worker had died between commit and report: the driver orders the unit again."""
+    manifest, out = read_manifest(seed, ["label"]), tmp_path / "128k/s"
+    out.mkdir(parents=True)
+    job, unit = _job(seed, out, INLINE, manifest.config or {}), WorkUnit(tuple(manifest.level_ids.tolist()))
+    first, again = (grow_unit(job, out, unit) for _ in range(2))
+    assert again.levels == first.levels == len(unit.level_ids)
+    assert again.solved == first.solved > 0
+    assert again.fragment == first.fragment
+
+
 def test_worker_that_does_not_find_the_seed_file_ends_the_job(seed: Path, tmp_path: Path) -> None:
     """As on a machine of a cluster that lacks the file, or has an older one."""
     manifest, out = read_manifest(seed, []), tmp_path / "128k/s"
