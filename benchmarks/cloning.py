@@ -94,9 +94,10 @@ def run(args: argparse.Namespace) -> Report:
         "plays at most 1,024 of the levels, that tenth included. Every policy is the average of its last updates, not "
         "the best of its validations: few levels are passed over hundreds of times, and an earlier end might suit them "
         "better.",
-        f"Points that ten times the levels add to *sampled, of solved*: {'; '.join(gains(results))}. "
-        "Where new levels are solved nearly as often as those cloned from, more levels cannot help much: the updates, "
-        "the network or the method set the limit.",
+        f"Points that ten times the levels add to *sampled, of solved*: {'; '.join(gains(results, PLAIN))}"
+        f"{''.join(f'; with {LONGER} {gain}' for gain in gains(results, LONGER))}. Where new levels are solved nearly "
+        "as often as those cloned from, more levels cannot help much: the updates, the network or the method set the "
+        "limit.",
         *[f"*Sampled, of solved*, seed by seed, in percent: {seeds}."] * bool(seeds),
         "Each policy was measured on sealed levels once, here.",
     ]
@@ -193,11 +194,11 @@ def mean_text(rates: list[dict[str, Any]]) -> str:
     return interval_text({name: np.mean([each[name] for each in rates], axis=0) for name in ("rate", "interval")})
 
 
-def gains(results: list[dict[str, Any]]) -> list[str]:
-    """Return what more levels add, between each two neighbouring numbers of them."""
+def gains(results: list[dict[str, Any]], variant: str) -> list[str]:
+    """Return what more levels add to clones of a variant, between each two neighbouring numbers of them."""
     rates: dict[int, list[float]] = {}
     for each in results:
-        if not each["variant"]:
+        if each["variant"] == variant:
             rates.setdefault(each["levels"], []).append(once_of(each))
     means = [(count, float(np.mean(some))) for count, some in sorted(rates.items())]
     return [
