@@ -12,6 +12,7 @@ from flax.typing import VariableDict
 from jaxtyping import Array, Float, Int
 
 from levelproof.experts.networks.over_levels import NetworkConfig, initial_policy, policy_logits
+from levelproof.experts.optimise import running_average
 from levelproof.experts.policy import log_probability, most_probable
 from levelproof.levelgen.identity.keys import key_of_seed
 from levelproof.levelgen.level import Level
@@ -99,9 +100,7 @@ def imitate(
     (_, likeness), gradient = jax.value_and_grad(_loss, has_aux=True)(now.params, transitions, network)
     change, state = optimiser_of(config).update(gradient, now.optimiser, now.params)
     params: Any = optax.apply_updates(now.params, change)
-    # The first updates count for more, so that the average soon forgets the initial weights
-    kept = jnp.minimum(config.average, (1.0 + now.updates) / (10.0 + now.updates))
-    average = jax.tree.map(lambda old, new: kept * old + (1 - kept) * new, now.average, params)
+    average = running_average(now.average, params, now.updates, config.average)
     return Imitation(params, state, average, now.updates + 1), likeness
 
 

@@ -24,6 +24,7 @@ from levelproof.experts.generalist.rollout import Ended, Experience, Playing, be
 from levelproof.experts.networks.layers import LOGITS
 from levelproof.experts.networks.over_levels import NetworkConfig, logits_and_summary
 from levelproof.experts.objective import advantages, normalised, terms
+from levelproof.experts.optimise import clipped_adam, running_average
 from levelproof.experts.policy import divergence
 from levelproof.levelgen.identity.keys import key_of_seed
 from levelproof.levelgen.task.lanes import Table
@@ -130,11 +131,6 @@ def _programs(recipe: TrainingRecipe, shapes: tuple[jax.ShapeDtypeStruct, ...], 
     )
 
 
-def optimiser_of(config: PPOConfig) -> optax.GradientTransformation:
-    clip = optax.clip_by_global_norm(config.max_gradient_norm)
-    return optax.chain(clip, optax.adam(config.learning_rate, eps=config.adam_epsilon))
-
-
 def _begin(recipe: TrainingRecipe, table: Table, start: VariableDict | None) -> Learner:
     """Initialise the policy, its critic and all lanes."""
     of_weights, of_levels = jax.random.split(jax.random.fold_in(key_of_seed(recipe.seed), BEGINNING))
@@ -145,7 +141,7 @@ def _begin(recipe: TrainingRecipe, table: Table, start: VariableDict | None) -> 
     playing = begin(table, levels, recipe.rules)
     # A copy, because the learner is donated, and no buffer can be donated twice
     average = jax.tree.map(jnp.copy, params.policy)
-    return Learner(params, optimiser_of(recipe.ppo).init(params), average, playing, state, jnp.int32(0))
+    return Learner(params, clipped_adam(recipe.ppo).init(params), average, playing, state, jnp.int32(0))
 
 
 def _advance(
@@ -166,7 +162,7 @@ def _advance(
     after = Learner(
         params,
         optimiser,
-        _averaged(learner.average, params.policy, update, ppo),
+        running_average(learner.average, params.policy, update, ppo.average),
         playing,
         recipe.curriculum.learn(learner.curriculum, _of_all_cores(ended)),
         update + 1,
@@ -243,7 +239,7 @@ def _epochs(
         gradient, means = jax.lax.pmean(jax.tree.map(lambda x: x / len(index), total), CORES)
         if starts:
             gradient = gradient._replace(policy=jax.tree.map(lambda x: jnp.where(fitting, 0, x), gradient.policy))
-        change, state = optimiser_of(ppo).update(gradient, state, params)
+        change, state = clipped_adam(ppo).update(gradient, state, params)
         changed: Any = optax.apply_updates(params, change)
         return (changed, state), means
 
@@ -252,7 +248,7 @@ def _epochs(
 
     state = learner.optimiser
     if starts:  # reset Adam when the policy starts to learn: moments of zero gradients make its first steps too long
-        fresh = optimiser_of(ppo).init(learner.params)
+        fresh = clipped_adam(ppo).init(learner.params)
         state = jax.tree.map(lambda new, old: jnp.where(update == ppo.critic_updates, new, old), fresh, state)
     (params, state), means = jax.lax.scan(epoch, (learner.params, state), jax.random.split(key, ppo.epochs))
     return params, state, jax.tree.map(jnp.mean, means)
@@ -280,12 +276,6 @@ def _kl_weight(config: PPOConfig, update: Array) -> Float[Array, ""]:
     """Return the weight of the divergence from the start, at an update."""
     since = jnp.maximum(update - config.critic_updates, 0)
     return config.kl_weight * jnp.maximum(1 - since / max(config.kl_updates, 1), 0.0)
-
-
-def _averaged(average: Any, policy: Any, update: Array, config: PPOConfig) -> Any:
-    # The first updates count for more, so that the average soon forgets the initial weights
-    kept = jnp.minimum(config.average, (1.0 + update) / (10.0 + update))
-    return jax.tree.map(lambda old, new: old + (1 - kept) * (new - old), average, policy)
 
 
 def _key(recipe: TrainingRecipe, update: Array) -> Key[Array, ""]:

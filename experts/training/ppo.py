@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from levelproof.experts.config import ExpertConfig
 from levelproof.experts.objective import normalised, terms
+from levelproof.experts.optimise import clipped_adam
 from levelproof.experts.policy import ActorCritic, Constant, Params, forward, initial
 from levelproof.levelgen.task.actions import CHOICES
 
@@ -38,17 +39,10 @@ class Samples(NamedTuple):
     rehearsed: Float[Array, " sample"]  # 1 where a success was rehearsed, else 0
 
 
-def optimiser(config: ExpertConfig) -> optax.GradientTransformation:
-    return optax.chain(
-        optax.clip_by_global_norm(config.max_gradient_norm),
-        optax.adam(config.learning_rate, eps=config.adam_epsilon),
-    )
-
-
 def init(key: Key[Array, ""], network: ActorCritic, constant: Constant, config: ExpertConfig) -> TrainState:
     """Initialise an expert."""
     params = initial(key, network, constant)
-    return TrainState(params, optimiser(config).init(params))
+    return TrainState(params, clipped_adam(config).init(params))
 
 
 def loss(
@@ -80,7 +74,7 @@ def update(
     config: ExpertConfig,
 ) -> TrainState:
     """Train for some epochs of minibatches, reshuffled each epoch. `rows` are samples as `as_rows` lays them out."""
-    transform = optimiser(config)
+    transform = clipped_adam(config)
 
     def learn(now, minibatch):
         gradient = jax.grad(loss)(now.params, network, constants, from_rows(minibatch), config)

@@ -11,7 +11,8 @@ from levelproof.experts.generalist.config import CurriculumConfig, PPOConfig
 from levelproof.experts.generalist.curricula import fresh
 from levelproof.experts.generalist.learnability import learnability
 from levelproof.experts.generalist.rollout import Experience, table_of
-from levelproof.experts.generalist.train import _advantages, _averaged, _kl_weight, _open_ended
+from levelproof.experts.generalist.train import _advantages, _kl_weight, _open_ended
+from levelproof.experts.optimise import running_average
 from levelproof.experts.policy import divergence, log_probability
 from levelproof.levelgen.level import ACTIONS
 from levelproof.levelgen.sampling.sampler import sample_levels, sampler
@@ -62,7 +63,7 @@ def test_divergence_is_the_mean_log_ratio_of_live_entries() -> None:
 
 def test_average_of_equal_weights_is_exact() -> None:
     weights = jax.random.normal(jax.random.key(0), (1000,))
-    assert (_averaged(weights, weights, jnp.int32(7), CONFIG) == weights).all()
+    assert (running_average(weights, weights, jnp.int32(7), 0.99) == weights).all()
 
 
 def test_random_levels_are_never_sealed_and_table_levels_are_all_drawn() -> None:
