@@ -61,6 +61,14 @@ def test_divergence_is_the_mean_log_ratio_of_live_entries() -> None:
     assert float(divergence(p, q, live)[0]) == pytest.approx(float((all_live * (log_p - log_q)).sum()), rel=1e-4)
 
 
+def test_average_keeps_little_of_the_first_weights() -> None:
+    """After updates 0, 1 and 2 it keeps 1/10, 2/11 and 3/12 of what it was, and never more than `most`."""
+    average = {"w": jnp.array([10.0])}
+    for updates, weight, expected in ((0, 0.0, 1.0), (1, 5.5, 4.6818), (2, 4.0, 4.1705), (1000, 6.0, 5.085)):
+        average = running_average(average, {"w": jnp.array([weight])}, jnp.int32(updates), 0.5)
+        assert float(average["w"][0]) == pytest.approx(expected, abs=1e-3)
+
+
 def test_average_of_equal_weights_is_exact() -> None:
     weights = jax.random.normal(jax.random.key(0), (1000,))
     assert (running_average(weights, weights, jnp.int32(7), 0.99) == weights).all()

@@ -53,13 +53,15 @@ def test_forked_process_reads_but_computes_no_observations(data: Dataset) -> Non
     plain, observing = data.grain(observation=None), data.grain()
     child = os.fork()
     if not child:
+        code = 2
         try:
             plain[0]
+            code = 3
             observing[0]
         except UserError as error:
-            os._exit(7 if "multiprocessing_context='spawn'" in str(error) else 1)
+            code = 7 if code == 3 and "multiprocessing_context='spawn'" in str(error) else 1
         finally:
-            os._exit(2)
+            os._exit(code)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
 
 

@@ -20,6 +20,12 @@ def test_in_subset_puts_each_level_and_its_copies_in_one_subset() -> None:
     assert in_subset(HASHES, None, 0.1).all()
 
 
+def test_in_subset_is_the_same_in_every_version() -> None:
+    """Else levels that one version validates on were trained on by another."""
+    first = np.flatnonzero(in_subset(HASHES, "validation", 0.1))[:12]
+    assert first.tolist() == [6, 7, 32, 46, 48, 60, 65, 74, 75, 84, 121, 122]
+
+
 def test_in_subset_keeps_validation_levels_when_the_share_grows() -> None:
     assert not (in_subset(HASHES, "validation", 0.1) & in_subset(HASHES, "train", 0.3)).any()
     assert in_subset(HASHES, "validation", 1).all()

@@ -42,7 +42,7 @@ def run() -> int:
             print(f"{schedule} ({cpu_seconds() - start:.1f} s of a core)", flush=True)
     print(table(schedules))
     print(f"{len(schedules)} schedules, {failed} failed; in {missed} the command ended before its fault.")
-    return bool(failed)
+    return bool(failed) or missed > len(schedules) // 4  # else faults no longer happen, and nothing is tested
 
 
 def cpu_seconds() -> float:

@@ -213,7 +213,7 @@ def _in_its_folder(world: World, schedule: Schedule, whole: Undisturbed) -> Comm
         time.sleep(0.002)
     if fault != ORPHAN:
         command.ended()
-    if log and log.exists():
+    if log and (log.exists() or (at and command.shared[HAPPENED])):  # at 0 nothing has happened yet
         lose_power(log, schedule.seed)
     if fault == FULL:
         command.shared[HAPPENED] = bool(command.wait())

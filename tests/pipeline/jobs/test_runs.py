@@ -79,7 +79,7 @@ def test_undisturbed_run_commits_every_level(undisturbed: Path) -> None:
     assert not (undisturbed / "quarantine").exists()
 
 
-@pytest.mark.campaign
+@pytest.mark.slow  # the only job on Ray that every change has to pass
 def test_number_of_workers_changes_no_result(undisturbed: Path, tmp_path: Path) -> None:
     done = run([*COMMAND, "executor=ray"], tmp_path)
     assert done.returncode == 0, done.stderr
