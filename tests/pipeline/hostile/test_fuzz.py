@@ -15,12 +15,14 @@ FEW, MANY = 100, 10_000
 MAX_GROWTH = 2**30  # bytes of memory more than after reading valid input
 MAX_LENGTH = 900  # characters of a sentence
 MAX_FINDINGS = 5  # reported per target
+ACCEPTED = 3  # of FEW inputs: a reader that refuses everything withstands everything
 
 
-def defect_of(target: Target, seed: int) -> str:
-    """Run a target on one input; describe any misbehaviour, empty if there is none."""
+def defect_of(target: Target, seed: int) -> str | None:
+    """Run a target on one input; describe any misbehaviour. Empty: it was refused in a sentence; None: accepted."""
     try:
         target(Random(seed))
+        return None
     except Refused as refusal:
         sentence = str(refusal)
         good = "\n" not in sentence and sentence.isprintable() and 0 < len(sentence) < MAX_LENGTH
@@ -28,18 +30,15 @@ def defect_of(target: Target, seed: int) -> str:
         return "" if good and whole else f"{type(refusal).__name__}: {sentence[:2000]!r}"
     except Exception:
         return traceback.format_exc(limit=-6)
-    return ""
-
-
-def findings(name: str, folder: Path, seeds: range) -> dict[int, str]:
-    target = TARGETS[name](folder)
-    return {seed: wrong for seed in seeds if (wrong := defect_of(target, seed))}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TARGETS)
 def test_reader_withstands_a_hundred_inputs(name: str, tmp_path: Path) -> None:
-    assert not findings(name, tmp_path, range(FEW))
+    target = TARGETS[name](tmp_path)
+    defects = {seed: defect_of(target, seed) for seed in range(FEW)}
+    assert not {seed: defect for seed, defect in defects.items() if defect}
+    assert [*defects.values()].count(None) >= ACCEPTED
 
 
 def bounded_findings(name: str, folder: Path, seeds: range) -> tuple[dict[int, str], int]:
