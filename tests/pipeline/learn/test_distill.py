@@ -64,6 +64,14 @@ def test_every_state_has_a_teacher_or_none(policy: Path) -> None:
 
 
 @pytest.mark.slow
+def test_kept_experts_of_a_split_label_states(tmp_path: Path) -> None:
+    job = ["generate", "levels=16", "budget=5k", "keep_experts=true", "executor=inline"]
+    assert here(job, tmp_path).returncode == 0
+    out = distilled(tmp_path, tmp_path / "data/5k/s", *TINY, "teachers.expert=4")
+    assert sum(line["distill/by_expert"] for line in metrics(out)) > 0
+
+
+@pytest.mark.slow
 def test_folder_holds_a_policy_with_its_origin(policy: Path, split: Path) -> None:
     loaded = levelproof.load_policy(policy)
     assert loaded.size is None
