@@ -1,7 +1,7 @@
 """How well cloned policies solve levels they have never seen, against the number of levels they were cloned from.
 
-All policies see equally many transitions, whatever their number of levels. A stopped run resumes: `levelproof clone`
-resumes from its checkpoint, and the folder keeps finished evaluations.
+All policies see equally many transitions, whatever their number of levels, but those with twice the updates. A stopped
+run resumes: `levelproof clone` resumes from its checkpoint, and the folder keeps finished evaluations.
 """
 
 import argparse
@@ -88,12 +88,12 @@ def run(args: argparse.Namespace) -> Report:
     notes = [
         f"*Of all*: {counts[ALL]} levels, of which some cannot be solved; *of solved*: the {counts[SOLVED]} that are "
         "labelled solved. One attempt at each level, or the best of 8.",
-        f"Each policy took {args.updates:,} updates{', with' * bool(settings)}{settings}. A tenth of the levels that "
-        "it was cloned from were kept from training, for validation. *Mirrored*: with `mirror=true`. Core-seconds are "
-        "those of the clone, with compiling, reading and validation, and without those of the data. The last column "
-        "plays at most 1,024 of the levels, that tenth included. Every policy is the average of its last updates, not "
-        "the best of its validations: few levels are passed over hundreds of times, and an earlier end might suit them "
-        "better.",
+        f"Each policy took {args.updates:,} updates{', with' * bool(settings)}{settings}, or twice as many where its "
+        "row says so. A tenth of the levels that it was cloned from were kept from training, for validation. "
+        "*Mirrored*: with `mirror=true`. Core-seconds are those of the clone, with compiling, reading and validation, "
+        "and without those of the data. The last column plays at most 1,024 of the levels, that tenth included. Every "
+        "policy is the average of its last updates, not the best of its validations: few levels are passed over "
+        "hundreds of times, and an earlier end might suit them better.",
         f"Points that ten times the levels add to *sampled, of solved*: {'; '.join(gains(results, PLAIN))}"
         f"{''.join(f'; with {LONGER} {gain}' for gain in gains(results, LONGER))}. Where new levels are solved nearly "
         "as often as those cloned from, more levels cannot help much: the updates, the network or the method set the "

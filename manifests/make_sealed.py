@@ -26,7 +26,7 @@ def main(folder: Path) -> None:
     path = Path(sealed.__file__).with_name(sealed.KNOWN)
     sizes = json.loads(path.read_text())["sizes"]
     for size in SIZES:
-        known = sizes.setdefault(size, {"labels": "", "successes": {}})
+        known = sizes.get(size, {"labels": "", "successes": {}})
         for split in folder.glob(f"*/{size}"):
             table = require_manifest(split, COLUMNS).table.sort_by("level_id")
             if not np.array_equal(table["level_id"].to_numpy(), np.array(sealed.SEALED)):
@@ -35,7 +35,8 @@ def main(folder: Path) -> None:
             known["successes"][budget] = "".join(sealed.SUCCESSES[each] for each in successes_of(table, ATTEMPTS))
             if max(known["successes"], key=steps_of) == budget:
                 known["labels"] = "".join(sealed.LETTERS[label] for label in table["label"].to_pylist())
-        known["successes"] = dict(sorted(known["successes"].items(), key=lambda item: steps_of(item[0])))
+        if known["successes"]:
+            sizes[size] = known | {"successes": dict(sorted(known["successes"].items(), key=lambda x: steps_of(x[0])))}
     path.write_text(json.dumps({"sizes": sizes}, indent=1) + "\n")
 
 

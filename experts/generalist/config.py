@@ -115,7 +115,7 @@ class ReplayConfig:
     @property
     def enough(self) -> int:
         """Number of attempted levels from which replay starts."""
-        return math.ceil(round(self.full_enough * self.capacity, 6))  # 0.9 * 10 is a little more than 9
+        return math.ceil(round(self.full_enough * self.capacity, 6))  # 0.07 * 100 is a little more than 7
 
 
 @dataclass(frozen=True)

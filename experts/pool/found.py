@@ -46,5 +46,6 @@ def joined(parts: Sequence[SearchFindings], order: Int[np.ndarray, " level"]) ->
 def findings_of(searched: SearchResult) -> SearchFindings:
     """Return what training and verdicts take from the search."""
     source = [Source.SEARCH if length else Source.EXPLORATION for length in searched.success.length]
-    env_steps, varied, cells, grew = (np.asarray(x, np.int64) for x in searched[1:])
-    return SearchFindings(searched.success, source, env_steps + varied, cells, grew > STILL_GREW_AFTER * env_steps)
+    explored, varied, cells, grew, shortened = (np.asarray(x, np.int64) for x in searched[1:])
+    env_steps = explored + varied + shortened
+    return SearchFindings(searched.success, source, env_steps, cells, grew > STILL_GREW_AFTER * explored)

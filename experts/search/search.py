@@ -35,9 +35,10 @@ class SearchResult(NamedTuple):
 
     success: Success  # length 0: none
     env_steps: Int[Array, " level"]  # of Go-Explore, in all lanes
-    varied: Int[Array, " level"]  # env steps of variations, and of shortening a success
+    varied: Int[Array, " level"]  # env steps of variations
     cells: Int[Array, " level"]  # cells reached, each of the width that cells had then
     grew: Int[Array, " level"]  # env steps when the last cell was reached
+    shortened: Int[Array, " level"]  # env steps that shorten a success
 
 
 class SearchJob(Submission):
@@ -45,13 +46,13 @@ class SearchJob(Submission):
 
     def __init__(self, levels: Level, level_ids: Int[np.ndarray, " level"]) -> None:
         super().__init__(levels, level_ids)
-        nothing = no_success(len(level_ids)), *np.zeros((4, len(level_ids)), np.int32)
+        nothing = no_success(len(level_ids)), *np.zeros((5, len(level_ids)), np.int32)
         self.known = SearchResult(*nothing)  # pyright: ignore[reportArgumentType]
 
     @property
     def env_steps(self) -> int:
         """Env steps so far."""
-        return int(self.known.env_steps.sum() + self.known.varied.sum())
+        return int(self.known.env_steps.sum() + self.known.varied.sum() + self.known.shortened.sum())
 
     def put(self, index: int, result: SearchResult) -> None:
         """Replace a level's result by its latest."""
@@ -121,7 +122,7 @@ class Searching:
             levels, level_ids = take(job.levels, some), job.level_ids[some]
             shorter = jax.device_get(shorten(levels, level_ids, given, self._scaled.endless, self._rules))
             results.success.action[some], results.success.length[some] = shorter.success
-            results.varied[some] += shorter.env_steps  # a level that pads its block counts once
+            results.shortened[some] = shorter.env_steps  # a level that pads its block counts once
         return results
 
     def _explore(self) -> None:
@@ -189,7 +190,7 @@ def side_by_side(config: SearchConfig) -> int:
 def explored(search: Search, ends: StopLimits) -> tuple[Bool[Array, " level"], SearchResult]:
     """Return which levels are done, and the results of all levels so far."""
     success, none = success_of(search.code, search.length), jnp.zeros_like(search.env_steps)
-    result = SearchResult(success, search.env_steps, none, search.archive.cells, search.grew)
+    result = SearchResult(success, search.env_steps, none, search.archive.cells, search.grew, none)
     return ~explore.under_way(search, ends), result
 
 

@@ -5,6 +5,7 @@ the level's first state. So the first episode is simulated, and the rest is copi
 """
 
 import heapq
+import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -31,9 +32,10 @@ from levelproof.physics.types import Manifold
 # A lane that ends its episode begins another, so that none waits for the longest one. Few episodes are not enough for
 # that in many lanes, and in few lanes a step of the engine costs more per lane.
 FEW_LANES, MANY_LANES = 16, 128
-MANY = 512  # episodes from which on there are MANY_LANES
-AT_ONCE = 1024  # episodes that are played together
-STEPS = 128  # most env steps of each lane in one call of the program
+FEW, MANY = 64, 512  # episodes: up to FEW have a small program; from MANY on there are MANY_LANES
+AT_ONCE = 2 * MANY  # most episodes that are played together
+STEPS = 128  # maximum env steps per lane in one call of a program
+STEPS_WITH_PIXELS = 8  # an image has 188 kB
 
 
 class PlayedEpisodes(NamedTuple):
@@ -93,9 +95,10 @@ def play_episodes(
     ends = np.cumsum(steps)
     first, rows = ends - steps, None
     constants: list[np.ndarray] = []
-    for begin in range(0, len(steps), AT_ONCE):
-        some = slice(begin, begin + AT_ONCE)
-        mine = slice(first[begin], ends[some][-1])
+    groups = -(-len(steps) // AT_ONCE)  # of equal sizes: of more than one, each has MANY
+    edges = [len(steps) * group // groups for group in range(groups + 1)]
+    for some in itertools.starmap(slice, itertools.pairwise(edges)):
+        mine = slice(first[some.start], ends[some][-1])
         levels, moves = _table(take(level, some)), _moves_of(action[..., some], steps[some])
         for where, played in _play_together(levels, moves, rules, fields, observation):
             if rows is None:
@@ -113,9 +116,10 @@ def play_episodes(
 
 
 def _table(level: Level) -> Level:
-    """Copy levels to the device, padded, so that one program serves any number of them."""
+    """Copy levels to the device, padded, so that three programs serve any number of them."""
     count = len(level)
-    return jax.device_put(take(level, np.minimum(np.arange(AT_ONCE if count >= MANY else MANY), count - 1)))
+    room = FEW if count <= FEW else MANY if count < MANY else AT_ONCE
+    return jax.device_put(take(level, np.minimum(np.arange(room), count - 1)))
 
 
 def _moves_of(action: Int[np.ndarray, "256 6 level"], steps: Int[np.ndarray, " level"]) -> _Moves:
@@ -131,12 +135,12 @@ def _play_together(
     """Play episodes; yield some rows and which ones they are, until all are played."""
     lanes = MANY_LANES if len(levels) > MANY else FEW_LANES
     begin, lane = (x[moves.episode] for x in _places(moves.step[moves.last] + 1, lanes))
-    time = begin + moves.step
+    time, length = begin + moves.step, STEPS_WITH_PIXELS if observation == ObservationType.PIXELS else STEPS
     playing = _waiting(levels, lanes, fields)
-    for start in range(0, int(time.max()) + 1, STEPS):
-        where = np.flatnonzero((time >= start) & (time < start + STEPS))
+    for start in range(0, int(time.max()) + 1, length):
+        where = np.flatnonzero((time >= start) & (time < start + length))
         at, mine = time[where] - start, lane[where]
-        turn = jax.tree.map(lambda x: np.zeros((STEPS, lanes, *x.shape[1:]), x.dtype), moves)
+        turn = jax.tree.map(lambda x: np.zeros((length, lanes, *x.shape[1:]), x.dtype), moves)
         for to, source in zip(turn, moves, strict=True):
             to[at, mine] = source[where]
         playing, played = _play_turn(levels, playing, turn, at.max() + 1, rules, fields, observation)
@@ -205,7 +209,7 @@ def _play_turn(
         return lanes, jax.tree.map(put, carry[1], made)
 
     shapes = jax.eval_shape(act, playing, jax.tree.map(lambda x: x[0], moves))[1]
-    empty = jax.tree.map(lambda x: jnp.zeros((STEPS, *x.shape), x.dtype), shapes)
+    empty = jax.tree.map(lambda x: jnp.zeros((len(moves.step), *x.shape), x.dtype), shapes)
     return jax.lax.fori_loop(0, count, turn, (playing, empty))
 
 

@@ -269,7 +269,7 @@ class Dataset:
         """Iterate over batches of first episodes, which threads prefetch, many batches at once.
 
         Takes the arguments of `batches`, and raises what it raises. `mask` is False in padding. Without `prefetch`,
-        two loads per core are read ahead, each of some thousand episodes, or of one batch with pixels.
+        two loads per core are read ahead, each of about a thousand episodes, or of one batch with pixels.
         """
         indices, fields, kind = self._subset(subset), expand_fields(fields, self.size), parse_observation(observation)
         order = EpochOrder(len(indices), batch_size, seed, process_index, process_count)

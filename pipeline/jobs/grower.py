@@ -69,12 +69,12 @@ def grow_unit(job: GrowConfig, split: Path, unit: WorkUnit) -> Summary:
         Failure: a seed file is damaged.
         OSError: a write failed; nothing is committed.
     """
-    source, left = Path(job.level_files), unit.only(set(unit.level_ids) - committed_levels(split, unit.name))
-    if left is None:  # an attempt committed them, and its worker died before it could say so
-        labels = read_manifest(source, ["label"], level_ids=list(unit.level_ids)).table.column("label")
-        return Summary(len(labels), labels.to_pylist().count(Label.SOLVED), EnvSteps(), fragment=unit.name)
-    table = read_manifest(source, level_ids=list(left.level_ids)).table
-    if lacking := {*left.level_ids} - {*table.column("level_id").to_pylist()}:
+    source, there = Path(job.level_files), committed_levels(split, unit.name) & {*unit.level_ids}
+    if there:  # an attempt committed all that it could, and its worker died before it could say so
+        labels = read_manifest(source, ["label"], level_ids=sorted(there)).table.column("label").to_pylist()
+        return Summary(len(there), labels.count(Label.SOLVED), EnvSteps(), fragment=unit.name)
+    table = read_manifest(source, level_ids=list(unit.level_ids)).table
+    if lacking := {*unit.level_ids} - {*table.column("level_id").to_pylist()}:
         raise SourceUnseen(
             f"The worker on {socket.gethostname()} does not find level {min(lacking)} in the seed files at "
             f"{as_typed(source)}: put them into a folder that all machines of the cluster share."

@@ -32,7 +32,7 @@ class PieceCache:
         return (self.folder / name).exists()
 
     def read(self, name: str, first: int, last: int) -> bytes | None:
-        """Return bytes of a piece; None: it is missing, or was damaged and is now removed."""
+        """Return bytes of a piece; None: it is missing, or damaged, and then removed if possible."""
         path = self.folder / name
         try:
             descriptor = regular(path, os.O_RDONLY)
@@ -98,6 +98,7 @@ def make_room(folder: Path, most: int) -> None:
     for _, size, path in sorted(files):
         if total <= KEPT_SHARE * most:
             break
-        with suppress(OSError):
-            os.unlink(path)
-        total -= size
+        with suppress(OSError):  # such as another user's file
+            with suppress(FileNotFoundError):
+                os.unlink(path)
+            total -= size

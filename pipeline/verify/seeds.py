@@ -4,6 +4,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from levelproof.levelgen.sampling.sampler import CHUNK
 from levelproof.pipeline.read.pace import ProgressBar
 from levelproof.pipeline.store.checksums import has_own
 from levelproof.pipeline.store.manifest import read_manifest
@@ -15,7 +16,7 @@ from levelproof.pipeline.store.seed.write import content_digest
 from levelproof.pipeline.verify.evidence import COLUMNS, Evidence, Recipe
 from levelproof.pipeline.verify.findings import Findings
 
-AT_ONCE = 4096  # rows examined together: to read any of a row group decompresses all of it
+READ = 16 * CHUNK  # rows read together: to read any of a row group decompresses all of it
 
 
 def examine_seeds(source: Path, console: Console | None) -> Findings:
@@ -45,11 +46,13 @@ def _examine_file(path: Path, findings: Findings, progress: ProgressBar) -> None
     for digest, first in zip(about.content, range(0, len(ids), ROW_GROUP), strict=True):
         hashes: list[str] = []
         some = ids[first : first + ROW_GROUP]
-        for begin in range(0, len(some), AT_ONCE):
-            rows = read_manifest(path, ["level_id", *COLUMNS], some[begin : begin + AT_ONCE]).table
-            Evidence(rows, recipe, {path.name: shard}, findings).examine()
+        for begin in range(0, len(some), READ):
+            rows = read_manifest(path, ["level_id", *COLUMNS], some[begin : begin + READ]).table
             hashes += rows.column("content_hash").to_pylist()
-            progress.advance(rows.num_rows)
+            for part in range(0, rows.num_rows, CHUNK):
+                examined = rows.slice(part, CHUNK)
+                Evidence(examined, recipe, {path.name: shard}, findings).examine()
+                progress.advance(examined.num_rows)
         if content_digest(hashes) != digest:
             last = int(some[-1])
             findings.add(f"Levels {some[0]} to {last} of {path} differ from those that it was written from.", [])

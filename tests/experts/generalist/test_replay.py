@@ -75,10 +75,10 @@ EVOLVE = evolve(EvolveConfig(children=16), EVOLVING, sampler("s"), DEFAULT_RULES
 
 
 @pytest.mark.parametrize(
-    ("share", "capacity", "enough"), [(0.9, 1000, 900), (0.9, 10, 9), (0.5, 5, 3), (0, 7, 0), (1, 7, 7)]
+    ("share", "capacity", "enough"), [(0.9, 1000, 900), (0.07, 100, 7), (0.5, 5, 3), (0, 7, 0), (1, 7, 7)]
 )
 def test_share_of_slots_that_starts_replay_is_a_number_of_levels(share: float, capacity: int, enough: int) -> None:
-    """In floats, (1 - 0.9) * 1000 is less than 100."""
+    """In floats, 0.07 * 100 is a little more than 7."""
     assert ReplayConfig(full_enough=share, capacity=capacity).enough == enough
 
 

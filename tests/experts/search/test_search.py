@@ -375,7 +375,7 @@ def test_label_without_expert_rests_on_the_search() -> None:
     some = np.array([0, 1, 2])
     procedure = Procedure(CONFIG, ExpertConfig(), StopConfig(rule=Rule.NONE))
     result = label(take(levels(), some), IDS[some], 2048, procedure)
-    searched = found().env_steps + found().varied
+    searched = found().env_steps + found().varied + found().shortened
     for i, verdict in zip(some, result.verdicts, strict=True):
         length = int(found().success.length[i])
         assert verdict.label is (Label.SOLVED if length else Label.UNSOLVED)

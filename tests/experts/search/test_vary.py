@@ -90,7 +90,7 @@ def test_search_runs_variations_after_go_explore() -> None:
     assert (np.asarray(result.env_steps)[BROKEN] == steps).all()
     assert (result.varied[BROKEN] >= CONFIG.variations).all()
     assert (result.varied % ROUND == 0).all()
-    assert job.env_steps == result.env_steps.sum() + result.varied.sum()
+    assert job.env_steps == sum(steps.sum() for steps in (result.env_steps, result.varied, result.shortened))
 
 
 @pytest.mark.slow
