@@ -105,7 +105,8 @@ def play_episodes(
                 rows = jax.tree.map(lambda x: np.empty((ends[-1], *x.shape[1:]), x.dtype), played)
             for to, source in zip(jax.tree.leaves(rows), jax.tree.leaves(played), strict=True):
                 to[mine][where] = source
-        constants.append(np.asarray(_constant_features(levels, observation))[: len(steps[some])])
+        if observation is not None:
+            constants.append(np.asarray(_constant_features(levels, observation))[: len(steps[some])])
     assert rows is not None, "there is at least one episode of at least one step"
     shown = rows.changing
     if observation is not None:

@@ -36,13 +36,8 @@ MADE_FROM: dict[str, tuple[str, ...]] = {
     "row": ("label",),
     **dict.fromkeys(("versions", "engine", "device"), ("made_with",)),
 }
-COSTS = (
-    "env_steps",
-    "evaluation_steps",
-    "scout_steps",
-    "search_steps",
-    "episodes",
-)  # 0: left out
+# Left out of seed files: 0 when read
+COSTS = ("env_steps", "evaluation_steps", "scout_steps", "search_steps", "episodes")
 Each = Callable[[pa.Table], pa.Table]
 
 
