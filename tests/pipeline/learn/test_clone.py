@@ -1,12 +1,7 @@
-"""Cloning of a policy from a small real split, and continuing after a real kill."""
+"""Cloning of a policy from a small real split."""
 
 import json
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -133,27 +128,6 @@ def test_policy_beats_random_play_on_levels_it_was_trained_on(policy: Path, spli
     draw = lambda key, _: (jax.random.uniform(key, (ACTIONS, len(levels))) * jnp.array(CHOICES)[:, None]).astype(int)
     random = solve_share(levels, draw)
     assert solve_share(levels, lambda key, world: loaded.sample(key, levels, world)) > random + 0.05
-
-
-@pytest.mark.slow
-def test_run_that_was_killed_continues_bit_for_bit(split: Path, tmp_path: Path) -> None:
-    words = [UPDATES, "pool=8", "refresh=7"]  # several rounds of levels
-    (tmp_path / "whole").mkdir()
-    whole = cloned(tmp_path / "whole", split, *words)
-    out = tmp_path / "policy"
-    command = [sys.executable, "-m", "tests.quick", "clone", str(split), "-o", str(out), *SETTINGS, *words]
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    killed = subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL)
-    while killed.poll() is None and len(metrics(out) if (out / "metrics.jsonl").exists() else []) < 2:
-        time.sleep(0.01)
-    killed.send_signal(signal.SIGKILL)
-    assert killed.wait() == -signal.SIGKILL, "it had ended before"
-    assert cloned(tmp_path, split, *words) == out
-    for name in ("policy.safetensors", "checkpoint.safetensors", "config.json"):
-        assert (out / name).read_bytes() == (whole / name).read_bytes()
-    losses = [[numbers["bc/loss"] for numbers in metrics(folder)] for folder in (whole, out)]
-    assert len(losses[1]) == 10
-    assert losses[0][-3:] == losses[1][-3:]
 
 
 @pytest.mark.campaign

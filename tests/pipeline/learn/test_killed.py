@@ -1,0 +1,58 @@
+"""Runs of `clone`, `train` and `distill`, killed for real, continue to the same bytes, compiled as users compile."""
+
+import json
+import signal
+from pathlib import Path
+
+import pytest
+
+from tests.pipeline.command import run, start, until
+
+pytestmark = pytest.mark.slow
+
+TINY = ("network.width=16", "network.depth=1")
+RUNS = {
+    "clone": ("SPLIT", "interval=20", "train.updates=200", "train.batch=128", "played=0", "validation=0.3", "pool=8"),
+    "train": ("levels=SPLIT", "interval=1", "cores=2", "ppo.environments=64", "ppo.minibatches=4"),
+    "distill": ("SPLIT", "interval=2", "train.updates=20", "train.batch=32", "episodes=8", "states=16", "buffer=64"),
+}
+MORE = {
+    "clone": ("refresh=7", "where="),
+    "train": ("ppo.horizon=32", f"ppo.env_steps={10 * 64 * 32}", "where=label = 'solved'"),
+    "distill": ("teachers.witness=2", "teachers.random=8", "teachers.learner=1"),
+}
+LINES = 10  # of metrics, one beside each checkpoint
+TIMES = ("seconds", "per_second")  # ends of the names of metrics that no run repeats
+
+
+@pytest.mark.parametrize("command", RUNS)
+def test_run_that_was_killed_continues_bit_for_bit(command: str, split: Path, tmp_path: Path) -> None:
+    words = [command, "-o", "policy", *(word.replace("SPLIT", str(split)) for word in RUNS[command])]
+    words += [*MORE[command], *TINY]
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    for folder in (whole, broken):
+        folder.mkdir()
+    done = run(words, whole)
+    assert done.returncode == 0, done.stderr
+    process = start(words, broken)
+    until(lambda: len(lines(broken)) >= 2, process)  # there is a checkpoint, and the run goes on
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL, "it had ended before"
+    assert len(lines(broken)) < LINES
+    done = run(words, broken)
+    assert done.returncode == 0, done.stderr
+    for name in ("policy.safetensors", "checkpoint.safetensors", "config.json"):
+        assert (broken / "policy" / name).read_bytes() == (whole / "policy" / name).read_bytes(), name
+    assert len(lines(broken)) == LINES
+    assert repeatable(lines(broken)[-1]) == repeatable(lines(whole)[-1])
+
+
+def lines(folder: Path) -> list[str]:
+    """Return the complete lines of a run's metrics."""
+    path = folder / "policy" / "metrics.jsonl"
+    return path.read_text().splitlines(keepends=True) if path.exists() else []
+
+
+def repeatable(line: str) -> dict[str, float]:
+    return {name: number for name, number in json.loads(line).items() if not name.endswith(TIMES)}
