@@ -1,6 +1,8 @@
 """The server of `play` over a real websocket, with the real engine."""
 
 import json
+import re
+import signal
 import time
 import urllib.error
 import urllib.request
@@ -14,7 +16,9 @@ import numpy as np
 import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin
 
+import levelproof
 from levelproof.experts.config import RECORD_STEPS, StopConfig
 from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy
 from levelproof.experts.networks.saved import Policy
@@ -32,7 +36,7 @@ from levelproof.pipeline.play.session import Session, empty_file
 from levelproof.pipeline.store.manifest import require_manifest
 from tests.experts.small import untouched
 from tests.pace import patience
-from tests.pipeline.command import assert_refused, here
+from tests.pipeline.command import assert_refused, heed_ctrl_c, here, start
 
 ANSWER_SECONDS = 120  # s; limit for an answer
 QUICK = replace(untouched(StopConfig()), search=SearchConfig(env_steps=65_536))
@@ -66,6 +70,25 @@ def ask(page: ClientConnection, request: str, /, **fields: Any) -> dict[str, Any
     while "training" in (answer := json.loads(page.recv(patience(ANSWER_SECONDS)))):
         pass
     return answer
+
+
+def test_command_serves_a_level_until_ctrl_c(split: Path, tmp_path: Path) -> None:
+    data = levelproof.open(split, where="label = 'solved'")
+    stored = data.read(np.arange(1), observation=None)
+    witness = stored.action[0, : np.argmax(stored.done[0]) + 1]
+    words = ["play", str(split), str(data.manifest["level_id"][0].as_py()), "--no-browser", "--port", "0"]
+    process = start(words, tmp_path, preexec_fn=heed_ctrl_c)
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    found = re.search(r"http://\S+:\d+", line)
+    assert found, (line, process.communicate())
+    with connect(f"{found[0].replace('http', 'ws')}/socket", origin=Origin(found[0]), max_size=2**26) as page:
+        assert ask(page, "play")["actions"] == witness.tolist()
+        assert ask(page, "attempt")["actions"], "by the policy that comes with levelproof"
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=patience(ANSWER_SECONDS))
+    assert (process.returncode, err) == (0, "")
+    assert "Done." in out
 
 
 def test_step_requests_reproduce_the_film(page: ClientConnection) -> None:
