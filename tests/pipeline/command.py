@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -85,6 +86,17 @@ def until(condition: Callable[[], T], process: subprocess.Popen[str]) -> T:
     except AssertionError as error:
         process.kill()
         raise AssertionError(f"{error}; it wrote {process.communicate()}") from None
+
+
+def wait_for_child(child: int) -> int:
+    """Return the exit code of a forked process; -N: signal N ended it. Raise AssertionError if it hangs."""
+    end = time.monotonic() + patience(COMMAND_SECONDS)
+    while (ended := os.waitpid(child, os.WNOHANG))[0] == 0:
+        if time.monotonic() > end:
+            os.kill(child, signal.SIGKILL)
+            raise AssertionError("the forked process hangs")
+        time.sleep(0.005)
+    return os.waitstatus_to_exitcode(ended[1])
 
 
 def assert_refused(done: subprocess.CompletedProcess[str], code: int, *words: str) -> None:

@@ -9,6 +9,7 @@ import pytest
 from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.dataset.sample import sample_data
 from levelproof.pipeline.errors import UserError
+from tests.pipeline.command import wait_for_child
 
 
 def test_source_elements_are_windows_by_name(data: Dataset) -> None:
@@ -62,7 +63,7 @@ def test_forked_process_reads_but_computes_no_observations(data: Dataset) -> Non
             code = 7 if code == 3 and "multiprocessing_context='spawn'" in str(error) else 1
         finally:
             os._exit(code)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+    assert wait_for_child(child) == 7
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
@@ -78,7 +79,7 @@ def test_forked_process_simulates_no_records() -> None:
             os._exit(7 if "cannot simulate records" in str(error) else 1)
         finally:
             os._exit(2)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+    assert wait_for_child(child) == 7
 
 
 @pytest.mark.campaign

@@ -1,18 +1,19 @@
 """Watching a run through its split, until it ends."""
 
 import json
-import threading
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from levelproof.experts.labels import Label
+from levelproof.pipeline.look import watch as module
 from levelproof.pipeline.look.watch import progress_table, read_progress, watch
 from levelproof.pipeline.store.event_files import new_run, write_events
 from levelproof.pipeline.store.locks import only_writer
-from tests.pace import patience
 from tests.pipeline.command import assert_refused, here
 from tests.pipeline.made import made_split
 
@@ -29,36 +30,41 @@ def state(event: str, age: float = 0.0, **changes: object) -> dict:
     return {"time": time.time() - age, "event": event, "workers": workers, **STATE, **changes}
 
 
-def test_watch_prints_a_line_per_refresh_until_the_run_ends(split: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def between_refreshes(monkeypatch: pytest.MonkeyPatch, *happenings: Callable[[], None]) -> None:
+    """Let these happen one after another, each while `watch` sleeps; it must not sleep more often."""
+    left = iter(happenings)
+    monkeypatch.setattr(module.time, "sleep", lambda _: next(left)())
+
+
+def test_watch_prints_a_line_per_refresh_until_the_run_ends(
+    split: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = new_run(split)
     failed = {"time": time.time(), "event": "failed", "unit": "0-1", "cause": "of this one"}
     write_events(run, [failed, state("progress")])
-    timer = threading.Timer(patience(0.5), lambda: write_events(run, [failed, state("ended", done=8)]))
+    later = [state("progress", done=6), state("ended", done=8)]
     with only_writer(split, print):
-        timer.start()
-        watch(split, True, Console(), interval=0.1)
+        between_refreshes(monkeypatch, *(partial(write_events, run, [failed, event]) for event in later))
+        watch(split, True, Console())
     facts = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [state["running"] for state in facts] == [True] * (len(facts) - 1) + [False]
-    assert len(facts) > 1
+    assert [state["running"] for state in facts] == [True, True, False]
+    assert [state["done"] for state in facts] == [4, 6, 8]
     assert (facts[0]["solved_share"], facts[0]["failed"], facts[0]["rate"]) == (0.75, ["0-1: of this one"], 12)
-    assert facts[-1]["done"] == 8
 
 
-def test_watch_waits_for_a_run_that_has_logged_nothing_yet(split: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_watch_waits_for_a_run_that_has_logged_nothing_yet(
+    split: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It cleans the split and starts workers; the latest events are those of the run that it continues."""
     write_events(new_run(split), [state("ended", age=60.0)])
     later = new_run(split)
-    timers = [
-        threading.Timer(patience(0.5), lambda: write_events(later, [state("progress", done=5)])),
-        threading.Timer(patience(1.0), lambda: write_events(later, [state("ended", done=8)])),
-    ]
+    events = [state("progress", done=5), state("ended", done=8)]
     with only_writer(split, print):
-        for timer in timers:
-            timer.start()
-        watch(split, True, Console(), interval=0.1)
+        between_refreshes(monkeypatch, *(partial(write_events, later, [event]) for event in events))
+        watch(split, True, Console())
     facts = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [state["running"] for state in facts] == [True] * (len(facts) - 1) + [False]
-    assert list(dict.fromkeys(state["done"] for state in facts)) == [4, 5, 8]
+    assert [state["running"] for state in facts] == [True, True, False]
+    assert [state["done"] for state in facts] == [4, 5, 8]
 
 
 def test_watch_tells_dead_runs_from_silent_ones(split: Path) -> None:

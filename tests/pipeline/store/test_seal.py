@@ -43,8 +43,7 @@ from levelproof.pipeline.store.manifest import (
 from levelproof.pipeline.store.mend import take_out
 from levelproof.pipeline.store.seal import CROWD, Piece, due, plan, seal
 from levelproof.pipeline.store.shard import Shard
-from tests.pace import patience
-from tests.pipeline.command import COMMAND_SECONDS
+from tests.pipeline.command import wait_for_child
 from tests.pipeline.made import commit_copy, made_job, made_result, made_split
 
 UNITS = 6  # of two levels each, one of them solved
@@ -216,14 +215,9 @@ WRITES = {"os.rename", "os.remove", "os.mkdir", "os.rmdir"}
 def killed(split: Path, step: int) -> bool:
     """Clean and seal in a process that is killed after this many changes to the split; return whether it was."""
     if child := os.fork():
-        status, end = None, time.monotonic() + patience(COMMAND_SECONDS)
-        while status is None:
-            ended, how = os.waitpid(child, os.WNOHANG)
-            status = how if ended else None
-            assert time.monotonic() < end, "it hangs"
-            time.sleep(0.005)
-        assert status in (0, signal.SIGKILL), "it failed"
-        return status == signal.SIGKILL
+        code = wait_for_child(child)
+        assert code in (0, -signal.SIGKILL), "it failed"
+        return code == -signal.SIGKILL
     left = iter(range(step))
 
     def count(event: str, arguments: tuple) -> None:
