@@ -62,8 +62,8 @@ class Tally:
         return min(1.0, (self.done + sum(levels for _, levels, _ in self.running.values())) / self.levels)
 
     @property
-    def trained(self) -> int:
-        """Number of levels that are decided, committed or not."""
+    def decided(self) -> int:
+        """Levels that are decided, committed or not; running ones count by their share of the budget, rounded down."""
         return self.done + int(sum(levels for _, levels, _ in self.running.values()))
 
     @property
@@ -73,14 +73,14 @@ class Tally:
     def text(self, rate: float, left: float | None) -> str:
         """Describe the progress, at `rate` env steps/s and with `left` s to go (None: not known yet)."""
         pace, (compiled, programs) = f"{rate:,.0f} env steps/s", self.compiled
-        if self.trained == self.levels:
+        if self.decided == self.levels:
             tail = "done" if self.done == self.levels else "writing"
         elif left is None:
             of_them = f", {compiled} of {programs} programs" if compiled < programs else ""
             tail = f"{pace} · {'...' if rate else f'compiling{of_them}'}"
         else:
             tail = f"{pace} · about {duration(left)} left"
-        return f"{self.trained}/{self.levels} levels · {self.solved_so_far} solved · {tail}"
+        return f"{self.decided:,}/{self.levels:,} levels · {self.solved_so_far:,} solved · {tail}"
 
 
 def say(console: Console, text: str) -> None:

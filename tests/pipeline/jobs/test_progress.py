@@ -22,7 +22,7 @@ def test_tally_share_grows_with_decided_levels() -> None:
     assert now.share == 0
     now.running[UNIT] = (8_000, 7.5, 3)
     assert now.share == pytest.approx(7.5 / 64)
-    assert (now.trained, now.solved_so_far) == (7, 3)
+    assert (now.decided, now.solved_so_far) == (7, 3)
     now.running[UNIT] = (9_000, 16, 3)
     assert now.share == pytest.approx(16 / 64)
     now.ended(UNIT, Summary(levels=16, solved=5, spent=EnvSteps(trained=16_000)))
