@@ -51,6 +51,8 @@ def add_body(level: Level, shape: str, x: float, y: float) -> Level:
             corners = np.array(SHAPES[shape], np.float32) * HALF_SIDE
             model.n_vertices[body], model.vertices[body] = len(corners), 0.0
             model.vertices[body][: len(corners)] = corners
+            # Pixels draw a triangle's unused corner, too, as the reference's do: put it on the side that closes it
+            model.vertices[body][len(corners) :] = (corners[0] + corners[-1]) / 2
         model.active[body], model.collision_mode[body] = True, NORMAL
         model.friction[body], model.restitution[body] = 1.0, 0.0
         one.role[body], one.density[body] = Role.PLAIN, DENSITY
@@ -90,7 +92,8 @@ def resize(level: Level, body: int, factor: float) -> Level:
         _movable_group(one, body)
         circle = body - one.size.polygons
         shape = one.model.radius[circle : circle + 1] if circle >= 0 else one.model.vertices[body]
-        reach = factor * (shape.max() if circle >= 0 else np.linalg.norm(shape, axis=-1).max())
+        corners = shape if circle >= 0 else np.linalg.norm(shape[: one.model.n_vertices[body]], axis=-1)
+        reach = factor * corners.max()
         if not MIN_REACH <= reach <= MAX_REACH:
             raise EditError(
                 f"The body would reach {reach:.2f} m from its centre: keep it between {MIN_REACH} and {MAX_REACH} m."
@@ -134,6 +137,7 @@ def add_joint(level: Level, x: float, y: float, fixed: bool = False) -> Level:
         model.joint_limited[row], model.joint_min[row], model.joint_max[row] = False, 0.0, 0.0
         model.motor_speed[row], model.motor_power[row] = MOTOR_SPEED, MOTOR_POWER
         one.motor_binding[row], one.motor_auto[row] = row % MOTOR_BINDINGS, False
+        one.state.joint_impulse[row], one.state.joint_angular_impulse[row] = 0.0, 0.0  # not those of a deleted joint
 
     return _edited(level, change)
 
@@ -295,7 +299,7 @@ def _joined(one: Level, body: int) -> list[int]:
 
 
 def _rejoin(one: Level, body: int) -> None:
-    """Move the bodies joined to a body so that both ends of every joint meet again."""
+    """Move the bodies joined to a body so that joints meet again; in a loop of joints, one may stay apart."""
     group = _joined(one, body)
     for rank, member in enumerate(group):
         for a, b, anchor_a, anchor_b in _joints(one):

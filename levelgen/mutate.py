@@ -87,10 +87,11 @@ def _edited(level: Level, rng: np.random.Generator) -> Level:
 
 @jax.jit(static_argnames="rules")
 def playable(level: Level, rules: TaskParams) -> Bool[Array, " lane"]:
-    """Find levels with a green, a blue and a driven body, and the centres of all bodies in the room, that begin calmly:
-    FIRST_STEPS without actuators neither end the episode nor leave a body faster than MAX_SPEED.
+    """Find levels that can be played: complete, inside the room, and calm at first.
 
-    The speed limit excludes most overlaps, since the engine flings overlapping bodies apart.
+    They have a green, a blue and a driven body, and the centres of all bodies lie in the room. FIRST_STEPS without
+    actions neither end the episode nor leave a body faster than MAX_SPEED; this excludes most overlaps, since the
+    engine flings overlapping bodies apart.
     """
     model, role = level.model, jnp.where(level.model.active, level.role, Role.PLAIN)
     rules = replace(rules, frame_skip=min(rules.frame_skip, FIRST_STEPS))
@@ -144,7 +145,7 @@ def _fix(level: Level, rng: np.random.Generator) -> Level:
 
 
 def _join(level: Level, rng: np.random.Generator) -> Level:
-    """Move a body next to another, and join them."""
+    """Move a body next to another, and join the two uppermost bodies there."""
     a, b = (_body(level, rng) for _ in range(2))
     if a == b:
         raise EditError("A joint holds two bodies together.")

@@ -103,10 +103,6 @@ class StoredProgram(Generic[T]):
         """Return the shapes of the results; arguments may be shapes."""
         return self.program.eval_shape(*args, **kwargs)
 
-    def lower(self, *args: Any, **kwargs: Any) -> Any:
-        """Lower as `jax.jit` does: arguments may be shapes."""
-        return self.program.lower(*args, **kwargs)
-
     def forget(self) -> None:
         """Drop the programs that this process holds, which take memory maps; the next calls load them again."""
         self._programs.clear()
@@ -143,7 +139,7 @@ class StoredProgram(Generic[T]):
     def _found_or_made(self, call: Call, args: Any, kwargs: Any) -> Any:
         name = f"{self.function.__module__}.{self.function.__qualname__}"
         request = f"{name} {self.options} {self._settings} {call} {_machine()}"
-        # An object without a text of its own has its address, which means nothing to another process
+        # Python's default text of an object contains its address, which differs between processes
         key = None if " at 0x" in request else key_by_sources(request, SOURCES)
         place = stored(key) if key else None
         return (place and _load(place.decode(), call)) or self._make(key, call, args, kwargs)
@@ -163,7 +159,7 @@ class StoredProgram(Generic[T]):
             return program
         before = _COMPILED.count
         compiled = lowered.compile()
-        # What XLA has loaded from JAX's cache, here or in another thread, it does not store whole
+        # XLA cannot serialize all of a program that it loaded from JAX's cache, where another thread may have put it
         if _COMPILED.count > before and _store(place, compiled, texts_in(text)):
             store(key, place.encode())
         return compiled
@@ -210,7 +206,7 @@ monitoring.register_event_listener(_COMPILED.note)
 
 
 def _store(place: str, compiled: Any, kernels: Sequence[str]) -> bool:
-    """Store a program that XLA has just compiled; return whether JAX can."""
+    """Store a program that XLA has just compiled; return False if JAX cannot serialize it."""
     try:
         code, _, tree = serialize_executable.serialize(compiled)
         results = jax.tree.unflatten(tree, range(tree.num_leaves))  # JAX cannot pickle the tree itself
@@ -231,7 +227,7 @@ def _load(place: str, call: Call) -> Any:
             register(text)
         inputs = jax.tree.structure((tuple(jax.tree.unflatten(call.tree, range(len(call.types)))), {}))
         program = serialize_executable.deserialize_and_load(code, inputs, jax.tree.structure(results))
-    except Exception:  # whatever is wrong with it, it can be made again
+    except Exception:  # an unusable file only costs another compilation
         return None
     monitoring.record_event_duration_secs(LOADED, time.perf_counter() - begun)
     return program
@@ -259,9 +255,12 @@ def _settings() -> tuple[Any, ...]:
     return values["jax_enable_x64"], values["jax_disable_most_optimizations"]
 
 
-@cache
 def _machine() -> str:
-    """Return what decides compiled code besides the program: settings, libraries and the processor."""
+    """Return what decides compiled code besides the program: present settings, libraries and the processor."""
     values = {name: value for name, value in jax.config.values.items() if "cache" not in name}
-    features = binding.get_host_cpu_features().flatten()
-    return f"{values} {os.environ.get('XLA_FLAGS')} {version('jaxlib')} {binding.get_host_cpu_name()} {features}"
+    return f"{values} {os.environ.get('XLA_FLAGS')} {_processor()}"
+
+
+@cache
+def _processor() -> str:
+    return f"{version('jaxlib')} {binding.get_host_cpu_name()} {binding.get_host_cpu_features().flatten()}"

@@ -64,9 +64,7 @@ class Constraints(NamedTuple):
     impulse: Float[Ref, "contact 2 lane"]  # accumulated, normal and tangent, N s
     batch: Float[Ref, "contact lane"]  # index of the solver batch; NO_BATCH where it does not push
     touching: Float[Ref, "kind lane"]  # number of touching pairs
-    acting: Int[
-        Ref, "contact"
-    ]  # indices of the contacts that push in some lane; each group starts at its first contact
+    acting: Int[Ref, "contact"]  # contacts that push in some lane; each group starts at its first contact
     counts: Int[Ref, "group"]  # number of contacts in `acting`
     listed: Int[Ref, "listing"]  # indices of the contacts that push, grouped by solver batch
     ends: Int[Ref, "boundary"]  # where each solver batch begins and ends in `listed`

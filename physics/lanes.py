@@ -81,8 +81,8 @@ def gather_pair(
     return jax.lax.fori_loop(1, count, visit, (first, first))
 
 
-def gather(count: int, read: Callable[[Any], T], index: Int[Array, " lane"], first: int = 0) -> T:
-    """Gather one of the rows first .. count - 1, a tree of arrays, by an index that differs by lane: read(index).
+def gather(count: int, read: Callable[[Any], T], index: Int[Array, " lane"]) -> T:
+    """Gather one of `count` rows, each a tree of arrays, by an index that differs by lane: read(index).
 
     Returns zeros in lanes whose index is not one of these rows, such as NOBODY.
     """
@@ -90,16 +90,13 @@ def gather(count: int, read: Callable[[Any], T], index: Int[Array, " lane"], fir
     def visit(i, picked):
         return jax.tree.map(lambda x, so_far: jnp.where(index == i, x, so_far), read(i), picked)
 
-    return jax.lax.fori_loop(first, count, visit, jax.tree.map(jnp.zeros_like, read(first)))
+    return jax.lax.fori_loop(0, count, visit, jax.tree.map(jnp.zeros_like, read(0)))
 
 
-def put(
-    index: Int[Array, " lane"], *changes: tuple[Ref, Array | float], count: int | None = None, first: int = 0
-) -> None:
+def put(index: Int[Array, " lane"], *changes: tuple[Ref, Array | float], first: int = 0) -> None:
     """Scatter: ref[index[lane], ..., lane] = value for each (ref, value).
 
-    Only rows first .. count - 1 can be written, by default all rows of the first reference; an index of any other row,
-    such as NOBODY, changes nothing.
+    Indices below `first`, NOBODY among them, change nothing.
     """
 
     def row(i):
@@ -109,7 +106,7 @@ def put(
 
         when(anywhere(index == i), write)
 
-    each(changes[0][0].shape[0] if count is None else count, row, first=first)
+    each(changes[0][0].shape[0], row, first=first)
 
 
 def scatter_add(ref: Ref, *changes: tuple[Int[Array, " lane"], Float[Array, "row lane"]], first: int = 0) -> None:

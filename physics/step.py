@@ -46,6 +46,7 @@ def step(
     Raises:
         ValueError: an array's shape differs from its annotation for the model's size.
         TypeError: an array's dtype differs from its annotation.
+        NotImplementedError: the CPU is neither x86-64 nor AArch64.
     """
     inputs = Inputs(model, state, motor, thrust)
     if state.position.dtype != jnp.float32:

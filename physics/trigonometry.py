@@ -1,4 +1,4 @@
-"""Sine, cosine, the angle of a vector and hyperbolic tangent from additions, multiplications and divisions alone.
+"""Sine, cosine, the angle of a vector and hyperbolic tangent from operations that all processors round alike.
 
 This gives a step the same bits on every machine; the functions of libraries and compilers round differently.
 Sine and cosine use the polynomials of Cephes (S. Moshier, netlib.org/cephes, sinf.c); their error is at most 1e-7 up

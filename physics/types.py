@@ -50,15 +50,15 @@ class Params:
     fixed_joint_bias: float = 2.0  # 1/s; pull of a fixed joint to its angle
     joint_limit_bias: float = 5.0  # 1/s; pull of a joint back within its limits
     joint_stiffness: float = 0.6  # share of the joint impulse applied per solver iteration; near 1: chains oscillate
-    max_position: float = 15.0  # m from 0 on each axis, within which bodies are kept
+    max_position: float = 15.0  # m from 0 on each axis, within which bodies are kept; below 10.2, the ceiling sinks
     max_velocity: float = 100.0  # m/s, limit on each axis in either direction
     max_angular_velocity: float = 50.0  # rad/s, limit in either direction
-    motor_speed: float = 6.0  # rad/s, of a joint whose motor speed is 1
-    motor_power: float = 900.0  # N m per kg m^2, of a joint whose motor power is 1
+    motor_speed: float = 6.0  # rad/s; target speed of a motor whose speed is 1
+    motor_power: float = 900.0  # N m per kg m^2; largest torque of a motor whose power is 1
     motor_decay: float = 0.1  # s/rad; steepness of a motor's speed control
-    motor_limit_zone: float = 0.1  # rad; a motor weakens this near to a joint limit
-    thruster_power: float = 10.0  # N, of a thruster whose power is 1
-    base_friction: float = 0.4  # multiplies the friction of each body, in every contact
+    motor_limit_zone: float = 0.1  # rad; distance from a joint limit within which a motor weakens
+    thruster_power: float = 10.0  # N; force of a thruster whose power is 1
+    base_friction: float = 0.4  # factor on the friction of every body
     faithful_padding: bool = True  # reproduce the reference's padding defect, see docs/physics.md
 
     def __post_init__(self) -> None:
@@ -139,4 +139,4 @@ class Manifold:
     normal: Float[Array, "contact 2 lane"]  # from the pair's first body to its second
     penetration: Float[Array, "contact lane"]  # m
     point: Float[Array, "contact 2 lane"]  # m, in the world
-    restitution_velocity: Float[Array, "contact lane"]  # m/s along the normal that restitution asks for
+    restitution_velocity: Float[Array, "contact lane"]  # m/s along the normal: approach (negative) times restitution

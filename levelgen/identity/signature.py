@@ -23,9 +23,10 @@ MAX_STEP = 2**31 - 1  # index of a step
 
 
 def signatures(level: Level) -> list[list[str]]:
-    """Return two hashes of each level, one per grid: `n1:` and 16 digits. Nearly equal levels share one of them.
+    """Return two hashes of each level, one per grid: `n1:` and 16 digits. Nearly equal levels mostly share one.
 
-    Levels with the same content share both: values without effect are left out here, too.
+    They share none if values cross steps of both grids, or an angle passes a full turn. Levels with the same content
+    share both: values without effect are left out here, too.
     """
     levels = level_first(level)
     return [list(both) for both in zip(*(_of_grid(levels, grid) for grid in range(GRIDS)), strict=True)]

@@ -102,7 +102,8 @@ def _motor_turn(level: Level, joint: int, action: np.ndarray | None) -> int:
     if action is None or not level.model.motor_on[joint] or level.model.joint_fixed[joint]:
         return 0
     choice = 1 if level.motor_auto[joint] else int(action[level.motor_binding[joint]])
-    return (0, 1, -1)[choice]
+    forward = 1 if level.model.motor_speed[joint] >= 0 else -1
+    return (0, forward, -forward)[choice]
 
 
 def _joint(level: Level, state: State, joint: int, action: np.ndarray | None) -> list[Part]:

@@ -13,6 +13,8 @@ from levelproof.physics.bounds import require
 
 # m, from a free body's centre to its farthest point: green and blue may each have to fit into one half of the world
 MAX_REACH = HALF_WORLD / 2
+MAX_NUMBER = 1_000_000  # of any field: far from where single precision overflows
+MAX_PROPOSALS = 1000
 CONTROL_WEIGHTS = ("motor_only_weight", "thruster_only_weight", "motor_and_thruster_weight")
 
 
@@ -27,9 +29,9 @@ class Distribution:
     """
 
     # The floor's role (plain otherwise)
-    floor_green_chance: float = 0.0  # the floor is green [floor_prob_green]
-    floor_blue_chance: float = 0.02  # the floor is blue [floor_prob_blue]
-    floor_red_chance: float = 0.08  # the floor is red [floor_prob_red]
+    floor_green_chance: float = 0.0  # chance that the floor is green [floor_prob_green]
+    floor_blue_chance: float = 0.02  # chance that the floor is blue [floor_prob_blue]
+    floor_red_chance: float = 0.08  # chance that the floor is red [floor_prob_red]
 
     # Shapes
     max_size: float = 1.0  # m, across a shape before lengthening [max_shape_size]
@@ -37,15 +39,15 @@ class Distribution:
     min_half_side: float = 0.05  # m, smallest half side of a rectangle (util.sample_dimensions)
     min_radius: float = 0.1  # m, smallest radius of a circle (util.sample_dimensions)
     circle_size_factor: float = 0.8  # multiplies max_size for circles [circle_max_size_coeff]
-    long_side_chance: float = 0.3  # one side of a rectangle is lengthened [large_rect_dim_chance]
+    long_side_chance: float = 0.3  # chance that one side of a rectangle is lengthened [large_rect_dim_chance]
     long_side_factor: float = 2.0  # multiplies the length of that side [large_rect_dim_scale]
 
     # Free bodies
-    opposite_sides_chance: float = 0.5  # green starts left, blue right [goal_body_opposide_side_chance]
-    fixed_chance: float = 0.02  # a body of mass 0 is fixed; heavier ones more often [fixate_chance_min]
+    opposite_sides_chance: float = 0.5  # chance that green starts left and blue right [goal_body_opposide_side_chance]
+    fixed_chance: float = 0.02  # chance that a body of mass 0 is fixed; of a heavier one: higher [fixate_chance_min]
     fixed_chance_per_mass: float = 4.0  # 1/kg; this times the mass is added to fixed_chance [fixate_chance_scale]
     max_fixed_chance: float = 1.0  # upper bound on the chance that a body is fixed [fixate_chance_max]
-    lowered_chance: float = 0.0  # a fixed body moves from the upper half to the lower [fixate_shape_bottom_bias]
+    lowered_chance: float = 0.0  # chance that a fixed body in the upper half is lowered [fixate_shape_bottom_bias]
     goal_lowered_chance: float = 0.6  # added to lowered_chance if not plain [fixate_shape_bottom_bias_special_role]
     red_weight: float = 1 / 3  # weight of red as a new body's role while none is red; that of plain: 1 (util.get_role)
 
@@ -55,27 +57,27 @@ class Distribution:
     motor_and_thruster_weight: float = 1.0  # weight of levels that require both
 
     # Connected bodies
-    connected_circle_chance: float = 0.5  # a joined body is a circle if both fit (mutators.mutate_add_connected_shape)
+    connected_circle_chance: float = 0.5  # chance of a circle if both kinds fit (mutators.mutate_add_connected_shape)
     fixed_target_weight: float = 0.05  # weight of a fixed body as partner; others: 1 [connect_to_fixated_prob_coeff]
     polygon_connections: int = 2  # maximum joints per polygon until all are full (mutators.mutate_add_connected_shape)
     min_revolute_joints: int = 2  # no joint is fixed before this many are revolute [min_rjoints_bias]
-    fixed_joint_chance: float = 0.5  # a joint after min_revolute_joints is fixed (mutators.mutate_add_connected_shape)
+    fixed_joint_chance: float = 0.5  # chance that a later joint is fixed (mutators.mutate_add_connected_shape)
     visible_margin: float = 0.05  # m that a body must reach beyond its partner at some angle [connect_visibility_min]
     hidden_penalty: float = 10.0  # contacts added if a proposal misses visible_margin [connect_no_visibility_bias]
 
     # Motors
-    motor_chance: float = 0.8  # a revolute joint's motor is on [motor_on_chance]
+    motor_chance: float = 0.8  # chance that a revolute joint's motor is on [motor_on_chance]
     min_motor_speed: float = 0.4  # slowest, as a multiple of task.physics.motor_speed [motor_min_speed]
     max_motor_speed: float = 3.0  # fastest, as a multiple of task.physics.motor_speed [motor_max_speed]
     min_motor_power: float = 1.0  # weakest, as a multiple of task.physics.motor_power [motor_min_power]
     max_motor_power: float = 3.0  # strongest, as a multiple of task.physics.motor_power [motor_max_power]
     max_wheel_power: float = 1.0  # strongest if it drives a circle: stronger wheels are unstable [wheel_max_power]
-    limit_chance: float = 0.4  # a revolute joint of two polygons has limits [joint_limit_chance]
+    limit_chance: float = 0.4  # chance that a revolute joint of two polygons has limits [joint_limit_chance]
     max_limit: float = math.pi  # rad, widest limit of a joint, to either side [joint_limit_max]
 
     # Thrusters
-    extra_thruster_chance: float = 0.3  # a thruster after the first is added [add_thruster_chance]
-    aligned_chance: float = 0.8  # a thruster points along the line through its body's centre [thruster_align_com_prob]
+    extra_thruster_chance: float = 0.3  # chance of each thruster after the first [add_thruster_chance]
+    aligned_chance: float = 0.8  # chance that a thruster aims through its body's centre [thruster_align_com_prob]
     min_thruster_power: float = 0.5  # weakest, per unit of mass (mutators.mutate_add_thruster)
     max_thruster_power: float = 2.0  # strongest, per unit of mass (mutators.mutate_add_thruster)
     thruster_power_factor: float = 2.0  # multiplies the drawn power [thruster_power_multiplier]
@@ -88,14 +90,16 @@ class Distribution:
     small_world: int = 7  # bodies; sizes up to this: one proposal, no fixed bodies (distributions.sample_kinetix_level)
 
     # Last
-    swap_chance: float = 0.5  # green and blue change roles if the floor is plain (distributions.sample_kinetix_level)
+    swap_chance: float = 0.5  # chance of swapping green and blue on a plain floor (distributions.sample_kinetix_level)
 
     def __post_init__(self) -> None:
         names = [field.name for field in fields(self)]
         require(self, [name for name in names if name.endswith("_chance")], 0, 1)
         require(self, names, 0)
+        require(self, [field.name for field in fields(self) if field.type is float], 0, MAX_NUMBER)
         require(self, [field.name for field in fields(self) if field.type is int], 0, 10**9)
         require(self, ("proposals", "polygon_connections", "min_half_side", "min_radius"), 0, above=True)
+        require(self, ("proposals",), 1, MAX_PROPOSALS)
         self._check_sums()
         for low, high in (
             ("min_motor_speed", "max_motor_speed"),

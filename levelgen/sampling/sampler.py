@@ -58,6 +58,11 @@ def sample_levels(level_ids: ArrayLike, size: Size | str, distribution: Distribu
     return jax.device_put(jax.tree.map(lambda *parts: np.concatenate(parts, -1)[..., : len(ids)], *chunks))
 
 
+def _is_key(level: Array) -> bool:
+    """Whether this is a random key, with its own dtype or as `jax.random.PRNGKey` makes them, not a level id."""
+    return jnp.issubdtype(level.dtype, jax.dtypes.prng_key) or (level.shape, level.dtype) == ((2,), jnp.uint32)
+
+
 def check_size(size: Size) -> None:
     """Raise ValueError if no level of this size can have a goal."""
     if size.polygons < FIXED_POLYGONS or size.bodies < FIXED_POLYGONS + GOAL_BODIES or min(size) < 0:
@@ -96,7 +101,7 @@ class Sampler:
 
     def __call__(self, level: Key[Array, ""] | Int[Array, ""] | int) -> Level:
         """Sample one level."""
-        if isinstance(level, jax.Array) and jnp.issubdtype(level.dtype, jax.dtypes.prng_key):
+        if isinstance(level, jax.Array) and _is_key(level):
             level = self.draw_id(level)
         return self._one((), level, ())
 

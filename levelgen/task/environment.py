@@ -73,7 +73,7 @@ class EnvState:
     timestep: Int[Array, ""]  # env steps taken in this episode
     last_distance: Float[Array, ""]  # m, between green and blue; NO_DISTANCE at the start
     level_index: Int[Array, ""]  # into `params.levels`, or a Sampler's level id, or into the levels of `starts`
-    episode: Int[Array, ""]  # automatic resets since `reset`
+    episode: Int[Array, ""]  # automatic resets since `reset`; an override state brings its own count
 
     @property
     def now(self) -> TaskState:

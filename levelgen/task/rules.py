@@ -20,6 +20,7 @@ from levelproof.physics.types import Params, State
 from levelproof.physics.vector import rows, select
 
 MAX_STEPS = 10**6
+MAX_REWARD_SCALE = 1_000_000  # 1/m
 NO_DISTANCE = -1.0  # last_distance before the first step of an episode
 
 
@@ -34,7 +35,7 @@ class TaskParams:
 
     def __post_init__(self) -> None:
         require(self, ("frame_skip", "max_timesteps"), 1, MAX_STEPS)
-        require(self, ("dense_reward_scale",), 0)
+        require(self, ("dense_reward_scale",), 0, MAX_REWARD_SCALE)
 
 
 DEFAULT_RULES = TaskParams()

@@ -24,7 +24,7 @@ Body = Callable[[Any, Any, Any, Any], None]  # body(arguments, tables, results, 
 
 
 def by_platform(as_machine_code: Callable[[T], R], on_all_lanes: Callable[[T], R], given: T) -> R:
-    """Call the first function if a program is for a CPU, else the second."""
+    """Call `as_machine_code` in a program for a CPU, else `on_all_lanes`."""
     if jax.default_backend() == "cpu":
         return as_machine_code(given)
     return jax.lax.platform_dependent(given, cpu=as_machine_code, default=on_all_lanes)

@@ -19,6 +19,7 @@ from levelproof.physics.codegen.lower import Memory, lower
 from levelproof.physics.codegen.values import INDEX
 
 COMPILING = threading.RLock()  # held while a kernel is compiled: LLVM and XLA accept a name only once in a process
+PASSES = "opt=3 jit speed_level=2"  # what `_object_code` asks of LLVM: part of the key of stored code
 NAME = "levelproof_"  # prefix of kernels' names, which XLA knows
 _libraries: dict[str, binding.ResourceTracker] = {}  # machine code must outlive every executable that calls it
 _texts: dict[str, str] = {}
@@ -92,7 +93,7 @@ def _object_code(text: str) -> bytes:
         passes.getModulePassManager().run(module, passes)
         return target.emit_object(module)
 
-    return cached("\n".join([llvmlite.__version__, cpu, features, text]), optimise)
+    return cached("\n".join([PASSES, llvmlite.__version__, cpu, features, text]), optimise)
 
 
 def _initialize() -> None:

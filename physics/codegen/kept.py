@@ -15,8 +15,8 @@ import llvmlite
 import numpy as np
 from llvmlite import binding
 
-BEGAN = time.time() - 5  # s; other modules were imported shortly before this one
-DIGEST = hashlib.sha256().digest_size  # bytes before the code: a file cut short by a full disk is not executed
+BEGAN = time.time() - 5  # s since 1970; earlier, as other modules were imported before this one
+DIGEST = hashlib.sha256().digest_size  # bytes of a checksum before the code, so that a truncated file is not executed
 
 
 def cached(key: str, make: Callable[[], bytes]) -> bytes:
@@ -70,10 +70,13 @@ def store(key: str, code: bytes) -> None:
     if not (folder := _folder()):
         return
     file = _file(folder, key)
+    unfinished = file.with_name(f".{file.name}.{os.getpid()}.{threading.get_ident()}")
     with suppress(OSError):
-        unfinished = file.with_name(f".{file.name}.{os.getpid()}.{threading.get_ident()}")
-        unfinished.write_bytes(hashlib.sha256(code).digest() + code)
-        unfinished.replace(file)
+        try:
+            unfinished.write_bytes(hashlib.sha256(code).digest() + code)
+            unfinished.replace(file)
+        finally:
+            unfinished.unlink(missing_ok=True)  # a full disk must not stay full because of it
 
 
 def _folder() -> str | None:

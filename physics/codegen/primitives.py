@@ -70,7 +70,7 @@ def _select(b, condition, x, y):
 
 
 def _shift(name: str) -> dict[str, Emit]:
-    """Return a function that emits a shift by a constant, known to be below 32: LLVM leaves longer shifts undefined."""
+    """Return what emits shifts by a constant of 0 to 31, by dtype: LLVM leaves longer shifts undefined."""
 
     def emit(b, x, y):
         if not isinstance(y, ir.Constant) or not 0 <= y.constant < 32:

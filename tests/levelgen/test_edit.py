@@ -117,6 +117,24 @@ def test_impossible_edit_raises_one_sentence(edit, words: str) -> None:
     assert str(error.value).endswith(".")
 
 
+def test_new_joint_has_no_impulse_of_a_deleted_one() -> None:
+    level = joined()
+    level.state.joint_impulse[:], level.state.joint_angular_impulse[:] = 3.0, 2.0
+    level = add_joint(delete(level, "joint", 0), 2.2, 2.2)
+    assert level.model.joint_active[0].all()
+    assert not level.state.joint_impulse[0].any()
+    assert not level.state.joint_angular_impulse[0].any()
+
+
+def test_unused_corner_of_a_triangle_lies_on_its_side() -> None:
+    """Pixels draw it as a corner; a level file may have it anywhere, where it does not limit the size."""
+    level = add_body(empty(), "triangle", 2.0, 2.0)
+    first, *_, last, unused = one_of(level).model.vertices[FIRST]
+    np.testing.assert_allclose(unused, (first + last) / 2)
+    level.model.vertices[FIRST, 3] = 500.0
+    assert resize(level, FIRST, 1.1).model.vertices[FIRST, 0, 1] == pytest.approx(1.1 * first[1])
+
+
 def test_reach_of_a_polygon_is_that_of_its_corners() -> None:
     """A square of 3.6 m has corners 2.55 m from its centre, and sides 1.8 m from it."""
     level = add_body(empty(), "rectangle", 2.0, 2.0)

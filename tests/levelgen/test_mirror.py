@@ -1,5 +1,7 @@
 """Mirror images of levels: mirroring twice restores a level, physics agrees, and most witnesses survive."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -32,6 +34,40 @@ def test_mirroring_twice_restores_the_level(levels: Level) -> None:
     assert (moved > 1e-3).all()
     given = actions()
     np.testing.assert_array_equal(mirror_actions(mirror_actions(given.transpose(0, 2, 1))), given.transpose(0, 2, 1))
+
+
+def test_what_is_attached_to_a_wall_changes_walls() -> None:
+    """As some joints of sampled levels of l are."""
+    levels = jax.device_get(levelproof.sample_levels(np.arange(2048), "l"))
+    joined = levels.model.joint_active & ((levels.model.joint_a == 1) | (levels.model.joint_a == 2))
+    levels = levels[joined.any(0)]
+    assert len(levels) > 3
+    image = mirror(levels)
+    ends = [np.stack(anchors_in_world(each)) for each in (levels, image)]
+    expected = ends[0] * np.array([-1, 1])[:, None] + np.array([WORLD_SIDE, 0])[:, None]
+    off = np.where(levels.model.joint_active[None, :, None], np.abs(expected - ends[1]), 0)
+    assert off.max() < 1e-5
+    assert (image.model.joint_a[levels.model.joint_a == 1] == 2).all()
+    assert (image.model.collides[1] == levels.model.collides[2][[0, 2, 1, *range(3, levels.size.bodies)]]).all()
+    impulses = np.random.default_rng(0).normal(size=levels.state.joint_impulse.shape).astype(np.float32)
+    moving = replace(levels, state=replace(levels.state, joint_impulse=impulses, joint_angular_impulse=impulses[:, 0]))
+    state = mirror(moving).state
+    np.testing.assert_array_equal(state.joint_impulse, impulses * [[-1], [1]])
+    np.testing.assert_array_equal(state.joint_angular_impulse, -impulses[:, 0])
+
+
+def anchors_in_world(level: Level) -> list[np.ndarray]:
+    """Return where both bodies of every joint have its anchor [joint, 2, lane]; they meet."""
+    ends = []
+    for body, anchor in (
+        (level.model.joint_a, level.model.joint_anchor_a),
+        (level.model.joint_b, level.model.joint_anchor_b),
+    ):
+        turn = np.take_along_axis(np.asarray(level.state.rotation), body, 0)
+        x, y = anchor[:, 0], anchor[:, 1]
+        turned = np.stack([np.cos(turn) * x - np.sin(turn) * y, np.sin(turn) * x + np.cos(turn) * y], 1)
+        ends.append(turned + np.take_along_axis(np.asarray(level.state.position), body[:, None], 0))
+    return ends
 
 
 def test_physics_of_the_image_is_the_image_of_the_physics(levels: Level) -> None:

@@ -13,6 +13,7 @@ import pytest
 from jax import monitoring
 from jax.experimental.compilation_cache import compilation_cache
 
+from levelproof.levelgen import programs
 from levelproof.levelgen.programs import LOADED, StoredProgram, jit_stored
 from levelproof.levelgen.proofs import examine
 from levelproof.levelgen.sampling.sampler import sample_levels
@@ -200,3 +201,13 @@ def test_most_optimisations_can_be_switched_off(folder: Path) -> None:
         jax.config.update("jax_disable_most_optimizations", False)
     assert made.count() == 2
     jax.tree.map(np.testing.assert_array_equal, *results)
+
+
+def test_present_settings_are_part_of_a_programs_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = programs._machine()
+    jax.config.update("jax_default_matmul_precision", "highest")
+    try:
+        assert programs._machine() != before
+    finally:
+        jax.config.update("jax_default_matmul_precision", None)
+    assert programs._machine() == before

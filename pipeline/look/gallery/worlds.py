@@ -59,7 +59,7 @@ def world_of(level: Level) -> str:
     anchors = lengths(model.joint_anchor_a)
     for joint in joints:
         fixed, motor, auto = model.joint_fixed[joint], model.motor_on[joint], level.motor_auto[joint]
-        kind = int(fixed) + 2 * int(motor) + 4 * int(auto)
+        kind = int(fixed) + 2 * int(motor) + 4 * int(auto) + 8 * int(model.motor_speed[joint] < 0)
         numbers += [drawn[model.joint_a[joint]], *anchors[joint], kind, level.motor_binding[joint]]
     positions, turns = lengths(model.thruster_position), angles(model.thruster_rotation)
     for thruster in thrusters:

@@ -79,6 +79,23 @@ def test_picture_shows_actuators_in_use(golden, actuator: str) -> None:
     assert shows(on, BINDING_COLOUR[entry])
 
 
+def test_arrow_follows_the_sign_of_a_motors_speed(golden) -> None:
+    """As in a level file, or a mirrored motor that runs by itself."""
+    level, model = golden.level, golden.level.model
+    lane = lane_with((model.joint_active & model.motor_on & ~model.joint_fixed & ~level.motor_auto)[:1])
+    backwards = dataclasses.replace(level, model=dataclasses.replace(model, motor_speed=-model.motor_speed))
+    entry, choices = int(level.motor_binding[0, lane]), []
+    for choice in (1, 2):
+        choices.append(OFF.copy())
+        choices[-1][entry] = choice
+    forward, back = (draw(level, golden.state, lane, action=action) for action in choices)
+    assert changed(forward, back) > 20
+    world = (0, 40, 480, forward.size[1] - 30)  # without caption and keys
+    for action, expected in zip(choices, (back, forward), strict=True):
+        drawn = draw(backwards, golden.state, lane, action=action)
+        assert changed(drawn.crop(world), expected.crop(world)) == 0
+
+
 def test_flame_points_opposite_to_the_force(golden) -> None:
     """The engine pushes a body along its thruster; the flame is on the other side."""
     model, state = golden.level.model, golden.state

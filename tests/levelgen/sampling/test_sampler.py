@@ -15,7 +15,7 @@ from levelproof.levelgen.files.kinetix import state_to_kinetix
 from levelproof.levelgen.level import SIZES, WORLD_SIDE, Level, Role
 from levelproof.levelgen.sampling.distribution import Distribution
 from levelproof.levelgen.sampling.overlap import WorldCircle, WorldPolygon, discs_touch, polygon_contacts, touch
-from levelproof.levelgen.sampling.sampler import CHUNK, sample_levels
+from levelproof.levelgen.sampling.sampler import CHUNK, sample_levels, sampler
 from levelproof.levelgen.sampling.scenery import FLOOR_TOP, empty_level
 from levelproof.levelgen.sampling.shuffle import collision_matrix
 from levelproof.levelgen.task.actions import action_mask
@@ -111,6 +111,12 @@ def test_content_of_levels_is_that_of_all_versions_so_far() -> None:
         text = b"".join(np.asarray(values)[..., :64].astype(np.uint8).tobytes() for values in whole)
         digests[name] = hashlib.sha256(text).hexdigest()[:16]
     assert digests == {"s": "e8988f5977c671a4", "m": "13e88ef1ba1b54dc", "l": "9e8317e219c8246d"}
+
+
+def test_sampler_takes_both_kinds_of_keys() -> None:
+    draw = sampler("s")
+    pairs = zip(*(jax.tree.leaves(draw(key(7))) for key in (jax.random.key, jax.random.PRNGKey)), strict=True)
+    assert all((a == b).all() for a, b in pairs)
 
 
 def test_sampler_returns_no_levels_for_no_ids() -> None:
@@ -252,7 +258,9 @@ def test_sampler_refuses_ids_out_of_range(level_id: int) -> None:
         ({"motor_chance": 1.3}, "motor_chance is 1.3: it must be between 0 and 1"),
         ({"floor_red_chance": -0.1}, "floor_red_chance is -0.1: it must be between 0 and 1"),
         ({"hidden_penalty": -1.0}, "hidden_penalty is -1.0: it must be at least 0"),
+        ({"hidden_penalty": 1e7}, "hidden_penalty is 10000000.0: it must be between 0 and 1000000"),
         ({"proposals": 0}, "proposals is 0: it must be above 0"),
+        ({"proposals": 1001}, "proposals is 1001: it must be between 1 and 1000"),
         ({"polygon_connections": 0}, "polygon_connections is 0: it must be above 0"),
         ({"max_limit": float("nan")}, "max_limit is nan: it must be a finite number"),
         ({"max_motor_speed": 0.1}, "min_motor_speed is 0.4: it must be at most max_motor_speed, 0.1"),

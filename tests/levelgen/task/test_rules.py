@@ -238,6 +238,7 @@ def test_touching_red_and_blue_at_once_fails() -> None:
         ({"frame_skip": 0}, "frame_skip is 0"),
         ({"max_timesteps": 0}, "max_timesteps"),
         ({"dense_reward_scale": -1.0}, "dense_reward_scale is -1.0"),
+        ({"dense_reward_scale": 1e7}, "dense_reward_scale is 10000000.0"),
     ],
 )
 def test_task_params_refuse_impossible_rules(change: dict, words: str) -> None:
