@@ -1,4 +1,4 @@
-"""Hydra's edge: override strings in, a typed JobConfig out."""
+"""Hydra's edge: override strings in, typed settings out."""
 
 import shlex
 from collections.abc import Iterable, Mapping, Sequence

@@ -19,9 +19,9 @@ class DistillConfig:
     where: str = "label = 'solved'"  # SQL condition on the manifest's columns that selects levels
     start: str = ""  # folder of a policy to continue training, with its network; empty: from scratch
     pool: int = 16_384  # levels in memory, drawn evenly if the split has more
-    interval: int = 100  # updates between rounds of questions, each with a checkpoint
+    interval: int = 100  # updates between rounds in which teachers label states; each ends with a checkpoint
     episodes: int = 512  # episodes that the learner plays in a round, each in another level
-    states: int = 256  # states of these episodes that teachers are asked about in a round
+    states: int = 256  # states of these episodes that teachers label in a round
     failed: float = 0.9  # share of these states from episodes that did not reach the goal
     path: int = 16  # maximum env steps to learn from a teacher's path to the goal, evenly spaced; 1: only the first
     buffer: int = 65_536  # transitions of teachers in memory, the latest ones

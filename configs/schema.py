@@ -155,12 +155,12 @@ class JobConfig:
 
     @property
     def stored(self) -> str:
-        """The density of its records, as settings."""
+        """Settings NAME=VALUE of the density of the records."""
         return stored_as(self.density, self.key_every)
 
     @property
     def origin(self) -> str:
-        """What its levels' rows come from, as a progress report says it."""
+        """Origin of the levels, for progress reports."""
         return f"budget {self.budget}"
 
     @property
@@ -216,7 +216,7 @@ class GrowConfig(JobConfig):
 
     @property
     def levels_per_unit(self) -> int:
-        """Number of levels in a work unit: more than of trained levels, because a record grows in milliseconds."""
+        """Number of levels in a work unit: more than in units that train, because a record grows in milliseconds."""
         return GROWN_UNIT * super().levels_per_unit
 
     @property

@@ -4,18 +4,23 @@ Takes effect only before JAX starts its backend.
 """
 
 import gc
+import multiprocessing
 import os
 import socket
 import sys
 import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
 from loky import cpu_count
 
 from levelproof.pipeline.claims import share_compiling
 from levelproof.pipeline.owned import own_folder
+
+T = TypeVar("T")
 
 CACHE_VARIABLE = "LEVELPROOF_CACHE_DIR"
 # One single-threaded process per core is twice as fast as one process with XLA's own threads. Besides, a sum split
@@ -169,3 +174,15 @@ def _allowed_cores() -> list[int]:
     if sys.platform == "linux":
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))
+
+
+def in_another_process(function: Callable[..., T], *arguments: Any) -> T:
+    """Run a function in another process: it starts JAX, and Ray forks this one. A stop ends that process."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+        answer = process.submit(function, *arguments)
+        try:
+            return answer.result()
+        except KeyboardInterrupt:  # SIGTERM reaches only this process
+            for child in multiprocessing.active_children():
+                child.terminate()
+            raise

@@ -11,20 +11,20 @@ from levelproof.pipeline.errors import Exit
 
 GRACE = 20.0  # s after the first signal in which workers commit what they can
 LAST = 28.0  # s from the first signal until this process ends itself; batch systems kill it after 30
+HASTE = 5.0  # s from the second signal until it does: threads may be compiling, which nothing interrupts
 
 
 class Stop:
     """A request to stop, made by signals.
 
     The first signal sets `asked` and, outside of a `heeded` block, raises KeyboardInterrupt, as every later signal
-    does. `LAST` seconds after the first, a timer ends the process, because neither compiled code nor a hanging system
-    call can be interrupted.
+    does. `LAST` seconds after the first, or `HASTE` seconds after the second if that is sooner, a timer ends the
+    process, because neither compiled code nor a hanging system call can be interrupted.
     """
 
     def __init__(self) -> None:
         self.asked = threading.Event()
-        self.clock = threading.Timer(LAST, os._exit, [Exit.INTERRUPTED])
-        self.clock.daemon = True
+        self.clock = _clock(LAST)
         self._heeds = False
         self._asked_at = 0.0
 
@@ -56,8 +56,19 @@ class Stop:
             self._asked_at = time.monotonic()
             self.clock.start()
             self.asked.set()
+        elif self.clock.interval > HASTE and self._asked_at + LAST - time.monotonic() > HASTE:
+            self.clock.cancel()
+            self.clock = _clock(HASTE)
+            self.clock.start()
         if not (first and self._heeds):
             raise KeyboardInterrupt
+
+
+def _clock(seconds: float) -> threading.Timer:
+    """Return a timer that ends this process."""
+    clock = threading.Timer(seconds, os._exit, [Exit.INTERRUPTED])
+    clock.daemon = True
+    return clock
 
 
 @contextmanager

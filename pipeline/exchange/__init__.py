@@ -1,1 +1,1 @@
-"""Exports of splits: Kinetix, Minari, tables and level files."""
+"""Exports of splits: Kinetix, Minari, tables, seed files and level files."""

@@ -1,4 +1,4 @@
-"""Seed files without their levels: they are added again from a folder of level files."""
+"""Completing seed files that were exported without levels, from a folder of level files."""
 
 from collections.abc import Iterator, Mapping
 from itertools import count
@@ -83,12 +83,12 @@ def add_levels(seed: Path, folder: Path, out: Path) -> None:
 
 
 def _levels_below(folder: Path, size: str) -> dict[int, list[FoundLevel]]:
-    """Return the levels of all level files of a size by the level's id, each with all its files, in path order."""
+    """Map level ids to all level files of this size that contain the level, in path order."""
     found: dict[int, list[FoundLevel]] = {}
     for path in sorted(folder.expanduser().absolute().rglob("*.json")):
         try:
             level = read_level_file(path).level
-        except LevelFileError:  # of another program, perhaps: what counts is whether a level is lacking in the end
+        except LevelFileError:  # perhaps another program's file; only missing levels are errors
             continue
         if name_of(level.size) == size and can_be_noted(str(path)):
             content_hash = content_hashes(level)[0]
@@ -116,8 +116,8 @@ def _groups(
 
 
 def _played(about: SeedFile, rows: pa.Table, found: Mapping[int, list[FoundLevel]]) -> list[FoundLevel]:
-    """Choose a file for each row: of several with its level, which may number its bodies otherwise, one that its
-    witness solves.
+    """Choose a level file for each row. If several contain its level, perhaps with bodies in another order, take the
+    first that its witness solves.
 
     Raises:
         Failure: there is none, or the seed file is damaged.
@@ -141,7 +141,7 @@ def _played(about: SeedFile, rows: pa.Table, found: Mapping[int, list[FoundLevel
 
 
 def _solves(about: SeedFile, rows: pa.Table, levels: list[Level]) -> np.ndarray:
-    """Whether the witness of each row has, in a level, the bits of its checksum, and solves it."""
+    """Whether each row's witness, played in its level, reproduces the row's checksum and reaches the goal."""
     steps = rows.column("steps_to_goal").to_numpy()
     try:
         action = unpack_witnesses(rows.column("witness").to_pylist(), steps)

@@ -14,11 +14,10 @@ from rich.console import Console
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.identity.content import content_hashes
 from levelproof.levelgen.sampling.sampler import CHUNK
-from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.exchange.tables import columns_for
 from levelproof.pipeline.read.levels import levels_of
 from levelproof.pipeline.read.pace import ProgressBar
-from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.read.select import columns_in, select_some
 from levelproof.pipeline.store.columns import COLUMNS
 from levelproof.pipeline.store.created import new_folder
 from levelproof.pipeline.store.manifest import Manifest, require_manifest, settings_metadata
@@ -41,9 +40,7 @@ def export_parquet(split: Path, where: str | None, out: Path) -> None:
         Failure: the split is damaged, or a write fails.
     """
     manifest = require_manifest(split, columns_in(where), compact=True)
-    ids = select(manifest.table, where).column("level_id").to_numpy()
-    if not len(ids):
-        raise UserError(f"No level of {split} meets the condition {where}: choose another one with --where.")
+    ids = select_some(split, manifest.table, where).column("level_id").to_numpy()
     metadata = settings_metadata(manifest.fragments[0].config_hash, manifest.fragments[0].config)
     written = 0
     with new_folder(out) as folder:

@@ -20,7 +20,7 @@ from levelproof.levelgen.task.actions import action_mask
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.read.levels import levels_of, writing_to
 from levelproof.pipeline.read.rows import read_rows
-from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.read.select import columns_in, select_some
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store import files
 from levelproof.pipeline.store.bar import with_bar
@@ -61,9 +61,7 @@ def export_seed(split: Path, where: str | None, out: Path, with_levels: bool = T
     """
     check_new_seed(out)
     manifest = require_manifest(split, [*READ, *columns_in(where)], compact=True)
-    rows = select(manifest.table, where)
-    if not rows.num_rows:
-        raise UserError(f"No level of {split} meets the condition {where}: choose another one with --where.")
+    rows = select_some(split, manifest.table, where)
     if not with_levels:
         if not from_files(manifest.config or {}):
             raise UserError(f"The levels of {as_typed(split)} are sampled from their ids: leave out --without-levels.")

@@ -22,7 +22,7 @@ os.environ |= {
 
 import ray
 from ray._private import ray_constants
-from ray.exceptions import ActorDiedError, ActorUnavailableError, RayError
+from ray.exceptions import ActorDiedError, ActorUnavailableError, RayError, RayTaskError
 from ray.util.metrics import Gauge
 from ray.util.placement_group import placement_group, remove_placement_group
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy, PlacementGroupSchedulingStrategy
@@ -97,6 +97,8 @@ def _reason(error: RayError) -> str:
     lines = str(error).strip().splitlines()
     if isinstance(error, ActorDiedError):
         return lines[-1] if error.actor_init_failed else "The worker died; if memory ran out, `dmesg` shows it"
+    if isinstance(error, RayTaskError):  # the first line names the call, the last one the cause
+        return f"The worker died: {last_line(error)}"
     return f"The worker died: {lines[0].rstrip('.')}"
 
 
@@ -106,7 +108,7 @@ def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board
     Raises:
         UserError: the cluster of RAY_ADDRESS cannot be reached.
         Failure: no worker can start.
-        KeyboardInterrupt: a stop was requested; workers have committed all levels that were decided.
+        KeyboardInterrupt: a stop was requested; workers have committed the decided levels, as far as time allowed.
     """
     with connected(), stop.heeded():  # in this order: Ray sets a handler of its own when it starts
         crew = Crew(with_absolute_paths(job), absolute(split), scheduler, board, served(split))
@@ -328,7 +330,7 @@ def _listening_on_loopback(alone: bool) -> Iterator[None]:
     ray_constants.ENABLE_RAY_CLUSTER = not alone
     try:
         yield
-    finally:  # whoever starts another cluster in this process decides for it
+    finally:  # a later cluster of this process makes its own choice
         ray_constants.ENABLE_RAY_CLUSTER = before
 
 

@@ -1,9 +1,7 @@
 """The jobs of `levelproof generate`: plan the missing units, run them on an executor, report to the user."""
 
-import multiprocessing
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,7 +21,7 @@ from levelproof.pipeline.jobs.progress import Board, Tally, say
 from levelproof.pipeline.jobs.schedule import Scheduler, UnitOutcome, WorkUnit, levels_text, schedule
 from levelproof.pipeline.jobs.seal import Sealer, sealing
 from levelproof.pipeline.read.level_files import Listing, levels_below
-from levelproof.pipeline.runtime import cache_folder, own_cores, prepare_jax
+from levelproof.pipeline.runtime import cache_folder, in_another_process, own_cores, prepare_jax
 from levelproof.pipeline.stopping import Stop, stoppable
 from levelproof.pipeline.store import quarantine
 from levelproof.pipeline.store.checkpoints import require_same_experts
@@ -87,6 +85,7 @@ def generate(
     return Exit.QUARANTINED if scheduler.quarantined else Exit.DONE
 
 
+@stoppable()
 def generate_from_files(job: JobConfig, command: Sequence[str], console: Console) -> Exit:
     """Label the levels of `job.level_files`, one size after another; report and leave out unusable files.
 
@@ -101,7 +100,7 @@ def generate_from_files(job: JobConfig, command: Sequence[str], console: Console
         prepare_jax(device=job.device, threads=len(own_cores()))
         listing = levels_below(folder, job)
     else:
-        listing = _list_in_subprocess(folder, job)
+        listing = in_another_process(_listed, folder, job)
     for sentence in (*listing.copies, *listing.refused):
         say(console, sentence)
     if not listing.levels:
@@ -156,10 +155,9 @@ def _make(
     return tally
 
 
-def _list_in_subprocess(folder: Path, job: JobConfig) -> Listing:
-    """Call `levels_below` in another process: Ray forks this one, which must not have started JAX before."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), prepare_jax, (None, "cpu")) as process:
-        return process.submit(levels_below, folder, job).result()
+def _listed(folder: Path, job: JobConfig) -> Listing:
+    prepare_jax(device="cpu")
+    return levels_below(folder, job)
 
 
 def _work(

@@ -53,7 +53,8 @@ def grow(source: Path, out: Path, settings: Sequence[str], console: Console) -> 
     job = _job(source, out, settings, manifest.config or {})
     _require_levels(source, manifest.config or {})
     command = ["levelproof", "grow", as_typed(source), "-o", str(out), *settings]
-    code = generate(job, command, console, level_ids=manifest.level_ids.tolist())
+    origins = {} if from_files(manifest.config or {}) else None  # ids of level files are far apart
+    code = generate(job, command, console, manifest.level_ids.tolist(), origins)
     return max(code, _report(source, out, manifest.level_ids, console))
 
 

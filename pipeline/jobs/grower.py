@@ -1,7 +1,6 @@
 """A worker that grows units from seed files: simulates every witness, checks it, and commits its record."""
 
 import socket
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -40,14 +39,12 @@ class Grower:
         self.stopping = False  # set by the executor to make the worker leave after the current unit
 
     def work(self, order: Order, seconds: float, ended: Callable[[], bool] = lambda: False) -> Round:
-        """Grow the ordered units, which takes as long as it takes, and ask for another."""
+        """Grow all ordered units, however long that takes, and ask for another."""
         outcomes = [self._grow(unit) for unit in order.units]
-        if not outcomes and not self.stopping:
-            time.sleep(min(seconds, 0.05))  # until there are units
         return self.leave(outcomes) if self.stopping else Round(outcomes, {}, wants=1)
 
     def leave(self, outcomes: Sequence[UnitOutcome] = ()) -> Round:
-        """Leave; every ordered unit is committed."""
+        """Leave; every ordered unit has ended."""
         return Round(list(outcomes), {}, wants=0, leaves=True)
 
     def _grow(self, unit: WorkUnit) -> UnitOutcome:

@@ -69,6 +69,11 @@ def import_folder(folder: Path, out: Path, console: Console) -> Exit:
         source = open_folder(folder.expanduser().absolute())
     except FormatError as error:
         raise UserError(f"Cannot import {folder}: {error}.") from None
+    names = [*(array.path.name for array in source.arrays), str(out)]  # in the columns `file` and `command`
+    if wrong := [name for name in names if not can_be_noted(name)]:
+        raise UserError(
+            f"Cannot import {folder}: the name {wrong[0]!r} has characters that terminals cannot show, so rename it."
+        )
     job = _as_stored(_job(source, out))
     command = ["levelproof", "import", str(source.path), "-o", str(out)]
     prepare_jax()

@@ -35,7 +35,9 @@ def require_library(log: str) -> None:
         if log in LIBRARIES:
             import_module(LIBRARIES[log])
     except ImportError:
-        raise UserError(f"log={log} needs {LIBRARIES[log]}: pip install 'levelproof[log]', or log=none.") from None
+        raise UserError(
+            f'log={log} needs {LIBRARIES[log]}: run `pip install -e ".[log]"` in the clone, or set log=none.'
+        ) from None
 
 
 @contextmanager

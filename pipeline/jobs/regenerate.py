@@ -39,7 +39,7 @@ def regenerate(arguments: Sequence[str], console: Console) -> Exit:
     source = Path(own["manifest"]).expanduser()
     manifest = require_manifest(source, columns_in(own.get("where")))
     config = manifest.config or {}
-    if config["sampler_version"] != SAMPLER_VERSION:
+    if not from_files(config) and config["sampler_version"] != SAMPLER_VERSION:
         raise UserError(
             f"The levels of {source} are of sampler version {config['sampler_version']}, and this program makes those "
             f"of version {SAMPLER_VERSION}: use the levelproof that made them."

@@ -1,9 +1,7 @@
 """`levelproof verify SPLIT --repair`: delete what is damaged, and regenerate it and what is missing bit for bit."""
 
-import multiprocessing
 import shlex
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,6 +15,7 @@ from levelproof.configs.schema import JobConfig, from_files, hash_of
 from levelproof.pipeline.errors import Exit, Failure, UserError
 from levelproof.pipeline.jobs.generate import generate
 from levelproof.pipeline.jobs.progress import say
+from levelproof.pipeline.runtime import in_another_process
 from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store.job_note import note_job, sound_note
 from levelproof.pipeline.store.layout import EXPERTS, data_paths, fragment_files
@@ -85,16 +84,7 @@ def repair(split: Path, settings: Sequence[str], console: Console) -> Exit:
 
 def _examine_split(split: Path, inline: bool) -> Findings:
     """Examine the split; if Ray will fork this process, which must not have started JAX before, in another process."""
-    if inline:
-        return _examine(split)
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-        findings = process.submit(_examine, split)
-        try:
-            return findings.result()
-        except KeyboardInterrupt:  # SIGTERM reaches only this process
-            for child in multiprocessing.active_children():
-                child.terminate()
-            raise
+    return _examine(split) if inline else in_another_process(_examine, split)
 
 
 def _examine(split: Path) -> Findings:

@@ -33,7 +33,7 @@ MIN_SHARE = 2  # unstarted levels of a worker below which it is not asked to sha
 
 @dataclass(frozen=True)
 class WorkUnit:
-    """Levels made and committed together: ids within one multiple of the job's `unit`, or as many level files."""
+    """Levels made and committed together; `plan_units` says which."""
 
     level_ids: tuple[int, ...] | range  # ascending
     origins: tuple[Origin, ...] = field(default=(), compare=False, repr=False)  # by level; empty: sampled levels
@@ -62,15 +62,15 @@ def plan_units(
 ) -> Iterator[WorkUnit]:
     """Yield units, ascending, that cover the level ids that are wanted and not done.
 
-    A unit never crosses an absolute multiple of `unit`, so jobs with other first levels cut at the same ids. Levels
-    with origins have ids far apart, so their units simply take `unit` levels each.
+    A unit never crosses an absolute multiple of `unit`, so jobs with other first levels cut at the same ids. If
+    `origins` is not None (it may be empty), ids are far apart, so each unit simply takes `unit` levels.
     """
     committed = ascending(np.fromiter(done, np.int64, len(done)))
     if origins is None:
         return _by_multiple(without(runs(wanted), committed), unit)
     left = np.setdiff1d(np.asarray(wanted, np.int64), committed)
     parts = (left[i : i + unit].tolist() for i in range(0, len(left), unit))
-    return (WorkUnit(tuple(part), tuple(origins[i] for i in part)) for part in parts)
+    return (WorkUnit(tuple(part), tuple(origins[i] for i in part) if origins else ()) for part in parts)
 
 
 def _by_multiple(runs: Iterable[tuple[int, int]], unit: int) -> Iterator[WorkUnit]:

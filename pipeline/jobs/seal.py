@@ -60,9 +60,8 @@ def seal_split(
         groups = store.plan(pieces, rows or store.ROWS)
         if wanted:
             others = {fragment.path for fragment in manifest.counting if fragment.densities != {stored_as(*wanted)}}
-            groups += [
-                [piece] for piece in pieces if piece.path in others and not any(piece in planned for planned in groups)
-            ]
+            planned = {piece for group in groups for piece in group}
+            groups += [[piece] for piece in pieces if piece.path in others and piece not in planned]
         columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
         with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
             task = bar.add_task("levels sealed", total=sum(piece.rows for group in groups for piece in group))
@@ -76,7 +75,8 @@ def seal_split(
                 note_density(split, density, key_every)
     merged = sum(map(len, groups))
     levels, fragments = sum(piece.rows for piece in pieces), len(pieces) - merged + len(groups)
-    done = f"merged {many(merged, 'fragment')} into {len(groups):,}" if groups else "there was nothing to seal"
+    verb, into = ("rewrote", "as") if density else ("merged", "into")
+    done = f"{verb} {many(merged, 'fragment')} {into} {len(groups):,}" if groups else "there was nothing to seal"
     print(f"{as_typed(split)}: {done}; it has {many(levels, 'level')} in {many(fragments, 'fragment')} now.")
     print(f"Next:  levelproof inspect {shlex.quote(as_typed(split))}")
 
@@ -111,7 +111,7 @@ class Sealer:
         self._broken = False
 
     def committed(self, unit: str, levels: int) -> None:
-        """Add the new fragment of the unit of this name, with so many levels; a unit without any has written none."""
+        """Add the new fragment, of `levels` rows, of the unit of this name; a unit without levels writes none."""
         if levels:
             path = fragment_path(self._split, unit)
             self._pieces[path] = Piece(path, levels, False)
@@ -119,7 +119,7 @@ class Sealer:
     def advance(self, first: int | None) -> None:
         """Account for a finished seal, and start the next if enough fragments lie below level id `first`.
 
-        No unit below `first` will be committed any more; None: no unit at all.
+        No unit below `first` still waits for its first attempt (failed ones may yet commit); None: no unit at all.
         """
         if self._running and not self._running[1].done():
             return

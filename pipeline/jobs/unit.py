@@ -1,6 +1,7 @@
 """One work unit: sample its levels, train their experts, replay every witness, write the shard, commit the fragment.
 
-Idempotent: an attempt that dies at any point leaves at most a shard that no fragment names. Knows nothing of workers.
+Idempotent: an attempt that dies leaves at most a mark, and a shard and experts that no fragment names. Knows nothing of
+workers.
 """
 
 import math
@@ -181,7 +182,7 @@ def _without(result: UnitResult, level_ids: Collection[int]) -> UnitResult:
 
 def _command(job: JobConfig, origin: Origin, level_id: int) -> str:
     """Return the command that labels an unsampled level again: from its level file, or from its imported split."""
-    if not RECORD.fullmatch(origin.file):
+    if not (origin.split and RECORD.fullmatch(origin.file)):
         return f"{shortest_command(job)} {shlex.quote(f'level_files={origin.file}')}"
     _, _, settings = shortest_command(job).split(maxsplit=2)
     return f"levelproof regenerate {shlex.quote(f'manifest={origin.split}')} {settings} where='level_id = {level_id}'"

@@ -1,1 +1,1 @@
-"""Reading of splits, of level files, and of the reference's folders."""
+"""Reading of splits, level files, policies, agents, and the reference's folders."""

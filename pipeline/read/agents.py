@@ -25,12 +25,13 @@ class Agent:
 
     The function is called as act(observation, live, uniform): symbolic-flat observations, float32
     [lane, feature]; which entries of the action have an effect, bool [lane, 6]; and random numbers in [0, 1), float32
-    [lane, 6], from which an agent draws if its results are to be the same every time. It returns integers [lane, 6].
+    [lane, 6]. It returns integers [lane, 6]. An agent that draws from these numbers alone gives the same results every
+    time.
     """
 
     def __init__(self, name: str, act: Callable[..., Any]) -> None:
         self.name, self._act = name, act
-        self.error: str | None = None  # what went wrong first; from then on the agent does nothing
+        self.error: str | None = None  # the first failure; afterwards the agent does nothing
 
     def __call__(self, params: Any, moment: Moment) -> Int[Array, "6 lane"]:
         observation = symbolic_flat(moment.level, moment.now.state)

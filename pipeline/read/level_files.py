@@ -21,6 +21,7 @@ from levelproof.pipeline.read.kinetix.zarr2 import FormatError
 from levelproof.pipeline.read.rows import read_row
 from levelproof.pipeline.store.contents import level_fields
 from levelproof.pipeline.store.fields import tree_of
+from levelproof.pipeline.store.layout import JOB, MANIFEST
 from levelproof.pipeline.store.origins import Origin, can_be_noted, place_of
 from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.store.seed.shard import stored_levels
@@ -46,7 +47,7 @@ def levels_below(folder: Path, job: JobConfig) -> Listing:
         UserError: the folder does not exist, or has no file.
     """
     one = folder.is_file() or place_of(str(folder.absolute()))
-    paths = [folder] if one else sorted(folder.rglob("*.json"))
+    paths = [folder] if one else level_file_paths(folder)
     if not paths:
         what = "There is no level file in" if folder.is_dir() else "There is no folder of level files at"
         raise UserError(f"{what} {folder}: set level_files=PATH to a folder of level files, or to one file.")
@@ -67,6 +68,12 @@ def levels_below(folder: Path, job: JobConfig) -> Listing:
         elif first is not origin:
             listing.copies.append(f"{path} has the same level as {first.file}, which represents both.")
     return listing
+
+
+def level_file_paths(folder: Path) -> list[Path]:
+    """Return the JSON files below a folder, in order, without those of splits, which a job may have written there."""
+    splits = {note.parent for note in folder.rglob(JOB) if (note.parent / MANIFEST).is_dir()}
+    return sorted(path for path in folder.rglob("*.json") if splits.isdisjoint(path.parents))
 
 
 def _origin_of(path: Path, job: JobConfig) -> Origin:
@@ -125,7 +132,10 @@ def levels_at(origins: Sequence[Origin]) -> Level:
         levels = stored_levels(Path(source), np.array([origin.level_id for origin in origins]))
         for origin, content_hash in zip(origins, content_hashes(levels), strict=True):
             if content_hash != origin.content_hash:
-                raise LevelUnavailable(f"{source} was written again: level {origin.level_id} has another content.")
+                raise LevelUnavailable(
+                    f"The seed file {source} has changed: its level {origin.level_id} is another one now, so restore "
+                    "the file."
+                )
         return levels
     return jax.tree.map(lambda *lanes: np.concatenate(lanes, -1), *map(level_at, origins))
 

@@ -51,10 +51,11 @@ def find_level(split: Path, level_id: int) -> tuple[Manifest, dict[str, Any]]:
     return manifest, manifest.table.to_pylist()[0]
 
 
-def levels_of(manifest: Manifest, rows: pa.Table) -> Level:
+def levels_of(manifest: Manifest, rows: pa.Table, in_command: bool = True) -> Level:
     """Return the levels of these rows (with COLUMNS), in row order: numpy arrays, level axis last.
 
-    Reads levels from their shards; regenerates those without a shard from their ids or files.
+    Reads levels from their shards; regenerates those without a shard from their ids or files. In a command, sets JAX
+    up before that; in a program of the user's, JAX keeps the user's settings.
 
     Raises:
         Failure: a shard is damaged, a file is missing or has changed, or as `recorded_settings`.
@@ -66,7 +67,8 @@ def levels_of(manifest: Manifest, rows: pa.Table) -> Level:
         names = [field.name for field in level_fields(size)]
         parts.append(tree_of(Level, read_rows(manifest.split, rows.filter(stored), names), "level/"))
     if not stored.all():
-        prepare_jax()
+        if in_command:
+            prepare_jax()
         others, distribution = rows.filter(~stored), distribution_of(manifest)
         check_sampler(manifest)
         if distribution is None and is_seed(manifest.split):

@@ -50,6 +50,14 @@ def select(table: pa.Table, where: str | None) -> pa.Table:
     return table.filter(np.isin(table.column("level_id").to_numpy(), chosen))
 
 
+def select_some(split: Path, table: pa.Table, where: str | None) -> pa.Table:
+    """Return the rows that `select` returns. Raise UserError if there are none, or as `select` does."""
+    rows = select(table, where)
+    if not rows.num_rows:
+        raise UserError(f"No level of {split} meets the condition {where}: choose another one with --where.")
+    return rows
+
+
 def select_witnessed(split: Path, where: str) -> pa.Table:
     """Return the rows (EXPORT_COLUMNS) of levels that have a witness and meet the condition, sorted by level id.
 

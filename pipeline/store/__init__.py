@@ -1,1 +1,1 @@
-"""Data on disk: manifests, shards, checkpoints, and the rules for writing them."""
+"""Data on disk or in a store: manifests, shards, checkpoints, seed files, and the rules for writing them."""

@@ -76,7 +76,7 @@ class FileKind:
     max_rows: int
     min_row_bytes: int  # of a file, per row
     max_row: int  # bytes in memory, per row
-    max_of: dict[str, int] = field(default_factory=dict)  # bytes in memory that a row of a column may take besides
+    max_of: dict[str, int] = field(default_factory=dict)  # additional bytes in memory per row, by column
 
 
 FRAGMENTS = FileKind(

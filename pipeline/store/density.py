@@ -104,8 +104,7 @@ def _from_actions(stored: Mapping[str, np.ndarray], encoding: Encoding, paths: f
     wrong |= _placed(led_elsewhere, at)
     unlike = _first(wrong)
     if len(lanes := np.flatnonzero(unlike >= 0)):
-        mine = take((level, moves, frames, at, there), lanes)
-        level, moves, frames, at, there = mine
+        level, moves, frames, at, there = take((level, moves, frames, at, there), lanes)
         state, distance = jax.tree.map(lambda x: _placed(x, at), (frames.state, frames.last_distance))
         again = resume(level, moves, KnownStates(state, distance, _placed(there, at)), encoding.rules, paths)
         for name, values in made.fields.items():

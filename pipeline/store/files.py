@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from contextlib import suppress
 from pathlib import Path
 
 from levelproof.pipeline.store import objects
@@ -22,10 +23,15 @@ def write(path: Path, data: bytes, mode: int = 0o666, durable: bool = False) -> 
         objects.put(path, data)
         return
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    write_new(temporary, data, mode)
-    if durable:
-        flush_entry(temporary)
-    temporary.replace(path)
+    try:
+        write_new(temporary, data, mode)
+        if durable:
+            flush_entry(temporary)
+        temporary.replace(path)
+    except BaseException:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)  # a full disk must not stay full because of it
+        raise
     if durable:
         flush_entry(path.parent)  # makes the file's name durable
 

@@ -20,7 +20,7 @@ from levelproof.pipeline.store.bounds import DAMAGE, DataUnread, bounded, unread
 from levelproof.pipeline.store.columns import COLUMNS, MANIFEST_VERSION, OLDEST_VERSION, VERSIONS, completed
 from levelproof.pipeline.store.formats import CONFIG_KEY, DENSITIES_KEY, DIGESTS_KEY, HASH_KEY, SEALED_KEY, VERSION_KEY
 from levelproof.pipeline.store.layout import ids_of
-from levelproof.pipeline.store.remote import mended
+from levelproof.pipeline.store.remote import FileChanged, mended
 
 FULL = (stored_as("full"),)
 DENSITIES = {stored_as(density, every) for density in get_args(Density) for every in KEYS_EVERY}
@@ -78,6 +78,8 @@ def read_fragment(
             _require_known(table)
     except FileNotFoundError:
         raise
+    except FileChanged as error:  # the listed version is gone: readers of a manifest list its fragments again
+        raise FileNotFoundError(str(path)) from error
     except PermissionError:
         raise DataUnread(f"The fragment {path} cannot be read: check its permissions.") from None
     except DAMAGE as error:

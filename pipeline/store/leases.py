@@ -42,10 +42,11 @@ class LeaseLost(Failure):
     """Another writer has taken a split over."""
 
     def __init__(self, split: Path) -> None:
-        reason = f"was silent for {SILENCE:.0f} s" if is_remote(split) else "ended, or its folder was removed"
+        silent = f"was silent for {SILENCE:.0f} s"
+        reason = silent if is_remote(split) else "ended, or its folder was removed"
         super().__init__(
-            f"Another command has taken over {as_typed(split)}, because this one {reason}: "
-            "this one commits nothing more there."
+            f"Another command has taken over {as_typed(split)}, because the command that this process works for "
+            f"{reason}: this process commits nothing more there."
         )
 
 

@@ -153,6 +153,6 @@ def _take(file: IO[str], how: int) -> bool:
     except OSError as error:
         raise LockRefused(
             f"The file system of {file.name} does not support locks ({error.strerror}): "
-            "choose a folder on another one with out=NAME, or have it mounted with locks."
+            "choose a folder on another one with out=NAME or -o, or have it mounted with locks."
         ) from error
     return True

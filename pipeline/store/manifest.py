@@ -29,7 +29,7 @@ from levelproof.pipeline.store.columns import COLUMNS, MANIFEST_VERSION, schema_
 from levelproof.pipeline.store.disk import flush, flush_entry, regular
 from levelproof.pipeline.store.formats import CONFIG_KEY, DENSITIES_KEY, DIGESTS_KEY, HASH_KEY, SEALED_KEY, VERSION_KEY
 from levelproof.pipeline.store.fragment import FULL, Fragment, read_fragment
-from levelproof.pipeline.store.layout import FRAGMENT, MANIFEST, Attempt, entries, ids_of
+from levelproof.pipeline.store.layout import FRAGMENT, JOB, MANIFEST, Attempt, entries, ids_of
 from levelproof.pipeline.store.remote import INDEX, is_remote
 from levelproof.pipeline.store.runs import ascending
 from levelproof.pipeline.store.seed.file import is_seed
@@ -355,14 +355,20 @@ def require_manifest(
     return manifest
 
 
+def splits_below(folder: Path) -> list[Path]:
+    """Return the splits that a local folder holds, up to two folders further down, as in `out=`; none of a URL."""
+    patterns = [] if is_remote(folder) else [f"{above}{MANIFEST}" for above in ("*/", "*/*/", "*/*/*/")]
+    return [path.parent for pattern in patterns for path in folder.glob(pattern)]
+
+
 def _nothing_at(split: Path) -> str:
     """Say in a sentence why a folder is not a split."""
     require_known(split)
-    here = [] if is_remote(split) else [f"{above}{MANIFEST}" for above in ("*/", "*/*/", "*/*/*/")]
-    below = [path.parent for pattern in here for path in split.glob(pattern)]
-    if below:
+    if below := splits_below(split):
         names = ", ".join(map(str, sorted(below)[:MAX_SHOWN]))
         return f"{split} is not a split, but a folder of {len(below)}: name one of them, such as {names}."
+    if not is_remote(split) and (split / JOB).exists():
+        return f"Nothing is committed in {split} yet: `levelproof status {split}` shows how far its job is."
     what = f"Nothing is committed in {split} yet" if split.is_dir() else f"There is no split at {split}"
     return f"{what}: give a folder such as data/128k/s that `levelproof generate` made."
 

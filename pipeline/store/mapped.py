@@ -1,7 +1,7 @@
 """Tables in memory-mapped files of the cache folder: the processes of a machine share one copy of their rows.
 
 A file is an Arrow file, the name of its table in the metadata, then a CRC-32C of all that. It appears whole or not at
-all; whatever else has its name is written again. What cannot be written stays in memory.
+all; any other file of its name is rewritten. Tables that cannot be written stay in memory.
 """
 
 import mmap
@@ -25,7 +25,7 @@ VERSION = 1  # of these files
 FOLDER = "tables"
 SUFFIX = ".arrow"
 NAME_KEY = b"levelproof.table"
-MIN_BYTES = 2**22  # in memory; smaller tables are read again as fast, and take no room that matters
+MIN_BYTES = 2**22  # in memory; rereading smaller tables is as fast, and they take little memory
 MOST = 10 * 10**9  # bytes of all files; the least recently used ones are deleted first
 BLOCK = 2**20  # bytes that are summed at once
 DAMAGE = (OSError, ValueError, pa.ArrowException, NotRegular, UserError)  # what another file of this name can raise

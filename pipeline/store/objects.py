@@ -116,6 +116,15 @@ def remove(paths: Iterable[Path]) -> None:
                     ask(path, partial(obstore_module().delete, store, key), "write")
 
 
+def _has_conditions(probe: Path) -> bool:
+    """Whether conditional writes of `probe` succeed and fail as they should."""
+    first = put_if(probe, b"1", None)
+    supported = first is not None and put_if(probe, b"2", None) is None
+    supported = supported and put_if(probe, b"3", first) is not None and put_if(probe, b"4", first) is None
+    remove([probe])
+    return supported
+
+
 def require_conditions(probe: Path) -> None:
     """Check that a store is writable and supports preconditions, by writing the unused file `probe`.
 
@@ -126,10 +135,7 @@ def require_conditions(probe: Path) -> None:
     if probe.parts[0] not in BUCKETS:
         raise UserError(f"Nothing can be written to {as_typed(probe.parent)}: give a folder, or a URL of s3, gs or az.")
     try:
-        first = put_if(probe, b"1", None)
-        supported = first is not None and put_if(probe, b"2", None) is None
-        supported = supported and put_if(probe, b"3", first) is not None and put_if(probe, b"4", first) is None
-        remove([probe])
+        supported = any(_has_conditions(probe) for _ in range(3))  # a writer that cleans the split may remove the probe
     except (NotImplementedError, obstore_module().exceptions.NotSupportedError):
         supported = False
     except StoreFailure as failure:

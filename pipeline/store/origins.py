@@ -55,7 +55,7 @@ class Origin(NamedTuple):
     shard: str = ""  # path below the split; empty: no shard has the level
     row: int = 0
     level_id: int = 0  # id of the level in the split
-    command: str = ""  # of the row that is made again; empty: a new one
+    command: str = ""  # of the row to regenerate; empty: a new row
 
 
 def origin_of(split: Path, row: Mapping[str, Any]) -> Origin:

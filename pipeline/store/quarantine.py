@@ -53,10 +53,10 @@ def _left(split: Path, done: np.ndarray) -> dict[Path, list[tuple[int, int]]]:
 
 
 def _left_of(note: Path, done: np.ndarray) -> list[tuple[int, int]]:
-    """Return a note's levels that are not done, as runs; the note is read only if its name does not decide."""
+    """Return a note's levels that are not done, as runs; the note is read unless its name shows that all are done."""
     by_name = [ids_of(note)]
     left = without(by_name, done)
-    return without(_levels_in(note) or by_name, done) if left and left != by_name else left
+    return without(_levels_in(note) or by_name, done) if left else left
 
 
 def _levels_in(note: Path) -> list[tuple[int, int]]:

@@ -1,6 +1,6 @@
 """Splits in object stores and on web servers, read in pieces through a cache on this machine.
 
-Readers of a split have a Path, which may stand for a URL; only this module knows where the split lies.
+A split's Path may stand for a URL: `is_remote` says whether it does, and `place` returns its store and key.
 """
 
 import os
@@ -60,6 +60,10 @@ class Stored(NamedTuple):
 
     tag: str  # differs if the bytes differ
     size: int  # bytes
+
+
+class FileChanged(OSError):
+    """A file differs from the version that was listed."""
 
 
 def is_remote(path: Path) -> bool:
@@ -232,7 +236,7 @@ class RemoteFile:
         tag = self._about.tag if self.path.parts[0] in HUB else _tag(about)  # the hub's file servers use other tags
         if (tag, about["size"], len(data)) != (*self._about, last - first):
             _known.pop(_folder_of(self.path), None)
-            raise OSError(f"{as_typed(self.path)} has changed")
+            raise FileChanged(f"{as_typed(self.path)} has changed")
         for i, n in enumerate(run):
             self._cache.put(self._piece(n), data[i * PIECE : (i + 1) * PIECE])
         return data
@@ -302,7 +306,7 @@ def obstore_module() -> Any:
         import obstore.store
     except ImportError:
         raise UserError(
-            "Reading splits that are not on this machine needs obstore: pip install 'levelproof[remote]'."
+            'Reading splits that are not on this machine needs obstore: run `pip install -e ".[remote]"` in the clone.'
         ) from None
     return obstore
 

@@ -148,7 +148,7 @@ def seal(
         merged = dict(zip((attempt.shard for attempt in attempts), places.values(), strict=False))
         for shard, sources in merged.items():
             merge_shards(shard, sources, moved, rows_a_file)
-        require_served(folder)
+        require_served(split)
         disown(replaced)
         write_fragment(attempts[0], _moved(table, merged), about.config_hash, about.config, True, densities, digests)
     sealed = fragment_path(split, unit)
@@ -232,7 +232,7 @@ def _attempted(
         if attempts[0].begun.exists():  # not committed
             for attempt in attempts:
                 drop(attempt.shard)
-            for mark in [*(attempt.begun for attempt in attempts), *map(begun_path, replaced)]:
+            for mark in map(begun_path, replaced):  # `drop` removed those of the new shards, unless a shard stays
                 remove(mark)
         raise
     finally:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from levelproof.configs.schema import REMOVED, JobConfig
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.store.disk import explaining_writes, write_new
+from levelproof.pipeline.store.disk import explaining_writes, flush_entry, write_new
 from levelproof.pipeline.store.layout import EVENTS, FOLDERS, JOB, split_path
 from levelproof.pipeline.store.leftovers import clean
 from levelproof.pipeline.store.locks import committing, only_writer
@@ -41,13 +41,13 @@ def writing(job: JobConfig, say: Callable[[str], None], split: Path | None = Non
             same = "the version of levelproof that made it" if changes.keys() & REMOVED else "the same settings"
             raise UserError(
                 f"The split {split} was made with another configuration ({changes_text(changes)}): "
-                f"use {same}, or another folder with out=NAME."
+                f"use {same}, or another folder with out=NAME or -o."
             )
         stored = {density for fragment in manifest.fragments for density in fragment.densities}
         if stored and job.stored not in stored:
             raise UserError(
                 f"The split {split} has {', '.join(sorted(stored))}, but this command sets {job.stored}: "
-                "use the same, or another folder with out=NAME."
+                "use the same, or another folder with out=NAME or -o."
             )
         yield split, manifest
 
@@ -93,13 +93,16 @@ def locked(split: Path, say: Callable[[str], None]) -> Iterator[None]:
 def _make_writable(split: Path) -> None:
     """Create the folder and check that files can be created in it."""
     try:
+        missing = [path for path in (split, *split.parents) if not path.exists()]
         split.mkdir(parents=True, exist_ok=True)
+        for path in missing:
+            flush_entry(path.parent)  # the folder's name outlasts a loss of power, as what is committed in it does
         probe = split / f".{JOB}.{os.getpid()}"
         write_new(probe, b"")
-        probe.unlink()
+        probe.unlink(missing_ok=True)  # another command that begins may clean it up
     except OSError as error:
         reason = error.strerror or type(error).__name__
-        raise UserError(f"Cannot write to {split} ({reason}): choose another folder with out=NAME.") from None
+        raise UserError(f"Cannot write to {split} ({reason}): choose another folder with out=NAME or -o.") from None
 
 
 def _require_own_folders(split: Path) -> None:
@@ -109,5 +112,5 @@ def _require_own_folders(split: Path) -> None:
             what = "a link" if path.is_symlink() else "not a folder"
             raise UserError(
                 f"A split must contain its own folders, but {path} is {what}: put a folder in its place, "
-                "or choose another one for the split with out=NAME."
+                "or choose another one for the split with out=NAME or -o."
             )

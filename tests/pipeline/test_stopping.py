@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from levelproof.pipeline.stopping import GRACE, stoppable
+from levelproof.pipeline.stopping import GRACE, HASTE, stoppable
 from tests.pace import patience
 from tests.pipeline.command import COMMAND_SECONDS, descendants, start, title, until
 from tests.pipeline.slow_seal import HUNG
@@ -63,6 +63,9 @@ def test_second_signal_interrupts_a_heeded_block() -> None:
         send(signal.SIGTERM)
         send(signal.SIGINT)
         pytest.fail("the second signal was ignored")
+    assert stop.clock.interval == HASTE, "threads that nothing interrupts would hold the process for longer"
+    stop.clock.join(patience(COMMAND_SECONDS))
+    assert not stop.clock.is_alive(), "the timer would end this process"
 
 
 @pytest.mark.campaign

@@ -1,6 +1,6 @@
 """Columns of a seed file, and the keys of its metadata. docs/seeds.md is their documentation.
 
-What follows from other columns or from the configuration is left out: `pipeline.store.seed.rows` makes it again.
+Columns that follow from others or from the configuration are left out; `pipeline.store.seed.rows` recomputes them.
 """
 
 from typing import Any

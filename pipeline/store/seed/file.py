@@ -1,4 +1,4 @@
-"""Seed files on a disk or behind a URL: which paths are some, and their bounded reading."""
+"""Seed files on a disk or behind a URL: recognising their paths, and reading them within bounds."""
 
 import json
 import re
@@ -77,7 +77,7 @@ def describe_seed(path: Path) -> SeedFile:
 
 
 def written(path: Path) -> tuple[int, ...] | None:
-    """Return what differs once a seed file is written again; None for a URL, and for a file that is gone."""
+    """Return a stamp that changes when a seed file is rewritten; None for a URL or a missing file."""
     try:
         about = path.stat()
     except OSError:
@@ -91,7 +91,7 @@ def read_seed(
     """Read columns of a seed file, of all rows or, with `level_ids` (ascending), of these levels' row groups at least.
 
     Raises:
-        UserError: it is no seed file.
+        UserError: it is not a seed file.
         Failure: it is missing, damaged, or has another version.
     """
     with _opened(path) as (about, file, stored_as):

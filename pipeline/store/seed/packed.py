@@ -47,7 +47,7 @@ def witness_text(witness: bytes, steps: int) -> str:
         steps: the column `steps_to_goal`.
 
     Raises:
-        ValueError: it is not a witness of so many env steps.
+        ValueError: it is not a witness of `steps` env steps.
     """
     action = unpack_witnesses([witness], np.array([steps]))[:steps, :, 0]
     begins = np.flatnonzero(np.concatenate([[True], (action[1:] != action[:-1]).any(1)])).tolist()
@@ -62,7 +62,7 @@ def unpack_witnesses(packed: Sequence[bytes], steps: Int[np.ndarray, " level"]) 
     """Unpack the actions of several episodes, zeros after their ends.
 
     Raises:
-        ValueError: these are not witnesses of so many env steps.
+        ValueError: these are not witnesses of `steps` env steps.
     """
     count = len(packed)
     level = np.repeat(np.arange(count), [len(one) for one in packed])

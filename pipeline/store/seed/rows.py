@@ -1,4 +1,4 @@
-"""Seed files as manifests: the columns that their rows leave out are made from the others and the configuration."""
+"""Seed files as manifests: columns that they leave out are recomputed from the others and the configuration."""
 
 import json
 import shlex

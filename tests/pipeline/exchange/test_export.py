@@ -98,7 +98,7 @@ def test_show_draws_a_level_file(split, tmp_path, capsys) -> None:
     for suffix in (".png", ".gif", ".mp4", ".svg"):
         assert main(["show", str(file), "-o", str(tmp_path / f"level{suffix}")]) == 0
     still, *films = capsys.readouterr().out.splitlines()
-    description = "level.json, a level of size s: a level file has no witness, so this is"
+    description = "level.json, a level of size s: no witness of a level file is shown, so this is"
     assert still.endswith(f"{description} its initial world")
     assert all(f"{description} what doing nothing does (" in film for film in films)
     assert (tmp_path / "level.gif").read_bytes().startswith(b"GIF8")

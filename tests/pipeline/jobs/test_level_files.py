@@ -22,7 +22,7 @@ from levelproof.pipeline.jobs.unit import failure
 from levelproof.pipeline.look.inspect import survey
 from levelproof.pipeline.look.query import RowQuery
 from levelproof.pipeline.look.status import read_status
-from levelproof.pipeline.read.level_files import LevelUnavailable, level_at, levels_below
+from levelproof.pipeline.read.level_files import LevelUnavailable, level_at, level_file_paths, levels_below
 from levelproof.pipeline.read.levels import levels_of
 from levelproof.pipeline.store.fields import arrays_of
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, require_manifest
@@ -221,6 +221,7 @@ def test_seed_file_of_level_files_has_their_content_and_grows_without_them(tmp_p
     assert_same(arrays_of(levels_of(after, after.table)), levels)
     findings = examine(seed)
     assert (findings.levels, findings.witnesses, findings.wrong) == (2, 1, {})
+    assert len(require_manifest(grown).fragments) == 1, "ids far apart share a unit"
     shutil.move(tmp_path / "gone", tmp_path / "mine")
     for source in (grown, tmp_path / "again/8k/s"):
         after = require_manifest(source)
@@ -270,3 +271,10 @@ def test_ray_workers_read_level_files_and_no_process_with_jax_forks(once: Path, 
     assert done.returncode == 2, done.stderr
     assert "fork" not in done.stderr
     assert rows_of(tmp_path / "data/5k/s").keys() == rows_of(once / "data/5k/s").keys()
+
+
+def test_files_of_a_split_below_the_folder_are_not_level_files(folder: Path) -> None:
+    """Such as one that an earlier run of the same command wrote there."""
+    (folder / "data").rename(folder / "mine/data")
+    names = {path.name for path in level_file_paths(folder / "mine")}
+    assert names == {"a.json", "copy.json", "b c.json", "larger.json", "rules.json", "bad.json"}

@@ -110,7 +110,7 @@ def test_generate_refuses_to_start_without_the_log_library(
 ) -> None:
     monkeypatch.setitem(sys.modules, library, None)
     done = here(["generate", *TINY, "executor=inline", f"log={log}"], tmp_path)
-    assert_refused(done, 2, f"log={log} needs {library}: pip install 'levelproof[log]'")
+    assert_refused(done, 2, f'log={log} needs {library}: run `pip install -e ".[log]"`')
     assert not list(tmp_path.iterdir())
 
 

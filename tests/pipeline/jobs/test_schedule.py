@@ -253,3 +253,9 @@ def test_levels_text_lists_runs_of_ids() -> None:
     assert levels_text([WorkUnit((7,))]) == "level 7"
     assert levels_text([WorkUnit((4, 5)), WorkUnit((2, 3)), WorkUnit((9,))]) == "levels 2 to 5, 9"
     assert levels_text([WorkUnit((i,)) for i in range(0, 20, 2)]) == "levels 0, 2, 4, 6 and 6 more runs of levels"
+
+
+def test_units_of_ids_far_apart_take_many_levels() -> None:
+    """Those of level files, labelled from their files or grown from seeds that have them."""
+    units = list(plan_units([5, 10**9, 2 * 10**9], [5], 2, {}))
+    assert units == [WorkUnit((10**9, 2 * 10**9))]

@@ -26,6 +26,7 @@ from levelproof.pipeline.jobs.unit import failure
 from levelproof.pipeline.store.checkpoints import save_experts
 from levelproof.pipeline.store.disk import explaining_writes, flush_entry
 from levelproof.pipeline.store.fields import arrays_of
+from levelproof.pipeline.store.files import write
 from levelproof.pipeline.store.layout import WRITER_LOCK, new_attempt, unit_name
 from levelproof.pipeline.store.locks import only_writer
 from levelproof.pipeline.store.manifest import begin_fragment, fragment_paths, write_fragment
@@ -94,6 +95,16 @@ def test_write_shard_fails_on_a_full_disk(tiny: Path) -> None:
     with pytest.raises(OSError, match="No space left") as refused:
         write_shard(new_attempt(tiny, unit_name(0, 0)).shard, [0, 1, 2], fields)
     assert refused.value.errno == errno.ENOSPC
+
+
+def test_failed_write_leaves_nothing(tiny: Path) -> None:
+    with pytest.raises(OSError, match="No space left"):
+        write(tiny / "large", bytes(2**22))
+    assert list(tiny.iterdir()) == []
+    (tiny / "folder").mkdir()
+    with pytest.raises(OSError, match="folder"):
+        write(tiny / "folder", b"")
+    assert [path.name for path in tiny.iterdir()] == ["folder"]
 
 
 def test_write_fragment_fails_on_a_full_disk(tiny: Path) -> None:

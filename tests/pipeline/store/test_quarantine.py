@@ -17,7 +17,13 @@ def test_given_up_returns_levels_that_are_not_done(tmp_path: Path) -> None:
     give_up(tmp_path, (3, 4, 9), "Failed 3 times")
     note = quarantine_path(tmp_path, unit_name(3, 9))
     assert note.read_text() == "Levels: 3-4, 9-9\nFailed 3 times"
-    left = {(): [(3, 9)], (1, 10): [(3, 9)], (3, 9): [(4, 4)], (4,): [(3, 3), (9, 9)], (5, 6): [(3, 4), (9, 9)]}
+    left = {
+        (): [(3, 4), (9, 9)],
+        (1, 10): [(3, 4), (9, 9)],
+        (3, 9): [(4, 4)],
+        (4,): [(3, 3), (9, 9)],
+        (5, 6): [(3, 4), (9, 9)],
+    }
     for done, missing in left.items():
         assert given_up(tmp_path, np.array(done, np.int64)) == {note: missing}
         drop_notes(tmp_path, np.array(done, np.int64))

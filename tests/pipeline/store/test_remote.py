@@ -29,8 +29,9 @@ from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.store import event_files, hub, job_note, leases, remote
 from levelproof.pipeline.store.event_files import events_of
 from levelproof.pipeline.store.fields import same_bits
+from levelproof.pipeline.store.fragment import read_fragment
 from levelproof.pipeline.store.job_note import NoteError, note_job, read_note
-from levelproof.pipeline.store.layout import WRITER_LOCK
+from levelproof.pipeline.store.layout import FRAGMENT, MANIFEST, WRITER_LOCK, entries
 from levelproof.pipeline.store.leases import is_leased
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, require_manifest
 from tests.pace import patience
@@ -215,6 +216,20 @@ def test_read_detects_a_file_that_changes_between_pieces(bucket: Bucket, split: 
     with pytest.raises(OSError, match=r"s3://bucket/data/s/shards/x has changed"):
         next(file.read([(PIECE, 10)]))
     assert next(remote.RemoteFile(path).read([(PIECE, 10)])) == b"1" * 10
+
+
+def test_fragment_that_was_replaced_since_it_was_listed_is_missing(bucket: Bucket, split: Path) -> None:
+    """So readers list again: a writer may replace it, such as by a fence. It is not damaged."""
+    path = min(entries(S3, MANIFEST, FRAGMENT, lambda _: True))
+    file = split / MANIFEST / path.name
+    key = f"data/s/{MANIFEST}/{path.name}"
+    bucket.put(key, file.read_bytes() + b"longer")
+    try:
+        with pytest.raises(FileNotFoundError):
+            read_fragment(path)
+    finally:
+        bucket.put(key, file.read_bytes())
+    assert require_manifest(S3, []).level_ids.tolist() == require_manifest(split, []).level_ids.tolist()
 
 
 @pytest.mark.parametrize("how", ["busy", "cut"])

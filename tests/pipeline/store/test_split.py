@@ -11,6 +11,7 @@ from levelproof.experts.labels import Label
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import commit
+from levelproof.pipeline.store import split as split_module
 from levelproof.pipeline.store.layout import FOLDERS, new_attempt
 from levelproof.pipeline.store.locks import is_written
 from levelproof.pipeline.store.manifest import (
@@ -43,6 +44,17 @@ def test_writing_creates_the_folder_of_budget_and_size(tmp_path: Path, job: JobC
         assert split == tmp_path / "data/128k/s"
         assert split.is_dir()
         assert len(manifest.level_ids) == 0
+
+
+def test_names_of_new_folders_outlast_a_loss_of_power(
+    tmp_path: Path, job: JobConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flushed = list[Path]()
+    monkeypatch.setattr(split_module, "flush_entry", flushed.append)
+    for new in ({tmp_path, tmp_path / "data", tmp_path / "data/128k"}, set[Path]()):
+        with writing(job, print):
+            assert {*flushed} == new
+            flushed.clear()
 
 
 def test_writing_refuses_another_configuration_and_lists_differences(tmp_path: Path, job: JobConfig) -> None:
