@@ -118,7 +118,7 @@ class StopConfig:
     rule: Rule = Rule.HALVING  # when a level leaves its slot
     successes: int = 1  # attempts of an evaluation that must succeed for a level to be solved
     share: float = 0.25  # share of an update's finished episodes that must reach the goal to trigger an evaluation
-    wait: int = 2048  # env steps of training between a failed evaluation and the next; doubles each time
+    wait: int = 2048  # env steps of training between a failed evaluation and the next; doubles up to six times
     polish: int = 0  # env steps of training after a level is solved, to shorten its witness; 0: none
     robustness: int = 65_536  # env steps of training after a level is solved, if its witness is fragile; 0: none
     first_rung: int = 2048  # env steps of training at the first rung; each rung doubles them

@@ -1,4 +1,4 @@
-"""First episodes on many levels side by side: of a policy for all levels, and of players that learned nothing.
+"""First episodes on many levels, played side by side by a policy for all levels or by an untrained player.
 
 An attempt's random numbers depend on the level's id, the seed and the attempt's number, not on the lanes beside it, so
 results do not depend on how levels are batched.

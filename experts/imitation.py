@@ -34,7 +34,7 @@ class ImitationConfig:
     warmup: int = 500  # updates over which the step size grows from 0; at most half of all
     weight_decay: float = 1e-4  # AdamW's weight decay
     max_gradient_norm: float = 1.0  # maximum global norm of the gradient
-    average: float = 0.999  # decay per update of the running average of the weights, which becomes the policy
+    average: float = 0.999  # maximum decay of the averaged weights, the policy; at update n at most n/(n+9)
 
     def __post_init__(self) -> None:
         require(self, ("updates", "batch"), 1)

@@ -41,7 +41,8 @@ def advantages(
 ) -> Float[Array, "time ..."]:
     """Estimate generalised advantages (Schulman et al. 2016, arXiv:1506.02438).
 
-    The value after an episode's end is 0: if only the time limit ended it, add that of the state reached to the reward.
+    The value after an episode's end is 0. To bootstrap at a time limit, add the discounted value of the state
+    reached to the reward.
     """
 
     def back(carry, now):

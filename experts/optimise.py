@@ -1,4 +1,4 @@
-"""What the training of experts and of policies over levels has in common: clipped Adam, and the average of weights."""
+"""Clipped Adam (experts, reinforcement over levels) and the running average of weights (policies over levels)."""
 
 from typing import Protocol, TypeVar
 

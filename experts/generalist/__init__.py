@@ -1,1 +1,1 @@
-"""One policy for all levels, trained by reinforcement learning: rollouts, updates, and which levels come next."""
+"""One policy for all levels: reinforcement, curricula, and teachers that label the states it visits."""

@@ -4,6 +4,7 @@ import math
 from contextlib import suppress
 from dataclasses import dataclass
 
+from levelproof.levelgen.task.rules import MAX_REWARD_SCALE
 from levelproof.physics.bounds import require
 
 CHUNK = 256  # lanes that go through the network together: their activations fit a core's cache
@@ -14,9 +15,9 @@ class PPOConfig:
     """Hyperparameters of training (hashable: pass as a static argument)."""
 
     env_steps: int = 20_000_000  # env steps of all lanes; training ends with the update that reaches them
-    environments: int = 512  # lanes, shared out over the cores
+    environments: int = 512  # lanes, divided evenly among the cores
     horizon: int = 64  # env steps in each lane between updates
-    dense_reward_scale: float = 0.2  # 1/m, of the shaping reward
+    dense_reward_scale: float = 0.2  # 1/m; shaping reward in training, in place of the task's
     epochs: int = 4  # passes over the samples of an update
     minibatches: int = 32  # updates of the weights in an epoch
     learning_rate: float = 3e-4  # Adam's step size
@@ -27,7 +28,7 @@ class PPOConfig:
     clip: float = 0.2  # maximum change of the probability ratio, and of the value, in either direction
     value_weight: float = 0.5  # weight of the value function's loss
     entropy_weight: float = 0.01  # weight of the policy's entropy, a bonus in the loss
-    average: float = 0.95  # decay per update of the running average of the weights, which becomes the policy
+    average: float = 0.95  # maximum decay of the averaged weights, the policy; at update n at most n/(n+9)
     # with start=POLICY
     critic_updates: int = 10  # first updates, which fit the value function and leave the policy as it is
     kl_weight: float = 0.0  # weight of the divergence from the start, a penalty in the loss; falls linearly to 0
@@ -37,7 +38,8 @@ class PPOConfig:
         require(self, ("env_steps", "environments", "horizon", "epochs", "minibatches"), 1)
         require(self, ("learning_rate", "adam_epsilon", "max_gradient_norm"), 0, above=True)
         require(self, ("discount", "gae_lambda", "clip", "average"), 0, 1)
-        require(self, ("dense_reward_scale", "value_weight", "entropy_weight", "kl_weight"), 0)
+        require(self, ("value_weight", "entropy_weight", "kl_weight"), 0)
+        require(self, ("dense_reward_scale",), 0, MAX_REWARD_SCALE)
         require(self, ("critic_updates", "kl_updates"), 0)
 
     @property
@@ -51,16 +53,16 @@ class PPOConfig:
         return -(-self.env_steps // self.steps_per_update)
 
     def shares_out(self, cores: int) -> bool:
-        """Whether lanes and minibatches share out evenly over so many cores."""
+        """Whether this number of cores divides the lanes evenly, and minibatches the chunks of a core."""
         with suppress(ValueError):
             return bool(self.chunk(cores))
         return False
 
     def chunk(self, cores: int) -> int:
-        """Return how many of a core's lanes go through the network together.
+        """Return the number of a core's lanes that go through the network together.
 
         Raises:
-            ValueError: lanes do not share out evenly, or chunks over the minibatches.
+            ValueError: the cores do not divide the lanes evenly, or the minibatches the chunks of a core.
         """
         lanes, over = divmod(self.environments, cores)
         width = min(lanes, CHUNK)

@@ -20,7 +20,7 @@ class Learnable(NamedTuple):
 
 
 def by_level(candidates: Int[Array, " candidate"], *counts: Int[Array, " candidate"]) -> tuple[Array, ...]:
-    """Sum the counts of duplicates, which small tables give: else the luckiest ones would fill all places.
+    """Add up the counts of duplicate candidates, which small tables give: else several lucky copies would be kept.
 
     Returns:
         Distinct levels, padded to as many as there are candidates, and their counts, which are 0 where padded.

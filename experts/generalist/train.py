@@ -116,18 +116,18 @@ def _programs(recipe: TrainingRecipe, shapes: tuple[jax.ShapeDtypeStruct, ...], 
     by_lane = lambda x: PartitionSpec(*[None] * (x.ndim - 1), CORES)
     kept = Learner(whole, whole, whole, jax.tree.map(by_lane, shape.playing), whole, whole)  # pyright: ignore
 
-    def on_cores(function: Callable, outputs: Any, donated: bool, *inputs: Any) -> Callable:
+    def on_cores(function: Callable, outputs: Any, *inputs: Any) -> Callable:
         mapped = jax.shard_map(
             partial(function, recipe), mesh=mesh, in_specs=inputs, out_specs=outputs, check_vma=False
         )
-        return jax.jit(mapped, donate_argnums=(0,) if donated else ())
+        return jax.jit(mapped, donate_argnums=0)
 
     to_mesh = jax.tree.map(lambda spec: NamedSharding(mesh, spec), kept, is_leaf=lambda x: x is whole)
     breeds = recipe.curriculum.breed is not None
     return Programs(
         jax.jit(partial(_begin, recipe), out_shardings=to_mesh),
-        on_cores(_advance, (kept, whole), True, kept, whole, whole),
-        partial(_breed, recipe, NamedSharding(mesh, whole)) if breeds else on_cores(_measure, kept, True, kept, whole),
+        on_cores(_advance, (kept, whole), kept, whole, whole),
+        partial(_breed, recipe, NamedSharding(mesh, whole)) if breeds else on_cores(_measure, kept, kept, whole),
     )
 
 
@@ -293,14 +293,15 @@ def _measure(recipe: TrainingRecipe, learner: Learner, table: Table) -> Learner:
         own = jnp.resize(level_index, (-(-len(level_index) // cores) * cores,)).reshape(cores, -1)[core]
         parts = jnp.resize(own, (-(-len(own) // CHUNK), min(CHUNK, len(own))))
 
-        def play(part: Array) -> tuple[Array, Array]:
+        def play(given: tuple[Array, Array]) -> tuple[Array, Array]:
+            number, part = given
             again = lambda key, lanes: part
             now = begin(table, part, recipe.rules)
-            each = jax.random.fold_in(key, part[0])
+            each = jax.random.fold_in(key, core * len(parts) + number)
             _, _, ended = rollout(learner.params, recipe.network, table, now, again, each, steps, recipe.rules)
             return ended.done.sum(0), (ended.done & ended.goal).sum(0)
 
-        counts = jax.tree.map(lambda x: x.reshape(-1)[: len(own)], jax.lax.map(play, parts))
+        counts = jax.tree.map(lambda x: x.reshape(-1)[: len(own)], jax.lax.map(play, (jnp.arange(len(parts)), parts)))
         gather = lambda x: jax.lax.all_gather(x, CORES, axis=0, tiled=True)[: len(level_index)]
         return jax.tree.map(gather, counts)
 

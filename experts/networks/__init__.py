@@ -1,1 +1,1 @@
-"""Networks of experts: from observations to action logits and a value."""
+"""Networks of experts and of policies for all levels, and saved policies."""

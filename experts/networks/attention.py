@@ -25,7 +25,7 @@ def _scores(a: Float[Array, "head unit i lane"], b: Float[Array, "head unit j la
 
 
 def _mixtures(share: Float[Array, "head i j lane"], value: Float[Array, "head unit j lane"]) -> Array:
-    """Return sums of the tokens' values, weighted by shares [head, i, j]; in the same way."""
+    """Return each token's sum of values, weighted by its shares [head, i, j]; dense over lanes, like `_scores`."""
     mixed = sum(share[:, None, :, j] * value[:, :, j, None] for j in range(share.shape[2]))
     return jax.lax.optimization_barrier(mixed)
 

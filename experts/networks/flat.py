@@ -18,7 +18,7 @@ from levelproof.physics.vector import rows
 
 
 class FirstKernel(NamedTuple):
-    """Kernel of a first layer, in two parts: slicing one would cost more than all products, backwards even more."""
+    """Kernel of a first layer, stored in two parts: slicing one costs more than its products, most of all backwards."""
 
     moving: Float[Array, "unit dynamic"]
     constant: Float[Array, "unit resting"]

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from levelproof.levelgen.task.actions import CHOICES
 
 LOGITS = sum(CHOICES)
-# Where networks leave what they know of a lane, [unit, lane], before their logits: a value function starts from it
+# Flax collection and name of a network's last hidden layer, [unit, lane], the input of a value function
 SUMMARY = ("intermediates", "known")
 HIDDEN_GAIN, POLICY_GAIN, VALUE_GAIN = 2**0.5, 0.01, 1.0  # of orthogonal initial kernels
 
@@ -56,8 +56,8 @@ class Dense(nn.Module):
 def maximum(x: Float[Array, "unit token lane"]) -> Float[Array, "unit lane"]:
     """Return the maximum over tokens, whose gradient goes to one of them.
 
-    The gradient of `jnp.max` divides by how many tokens equal the maximum. XLA may compute them once more for that, and
-    round differently: none is equal then, and the gradient is NaN.
+    The gradient of `jnp.max` divides by the number of tokens that equal the maximum. If XLA recomputes the tokens and
+    rounds differently, that number can be 0, and the gradient NaN.
     """
     while x.shape[1] > 1:
         half = x.shape[1] // 2

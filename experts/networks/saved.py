@@ -108,7 +108,7 @@ def save_policy(folder: str | os.PathLike[str], policy: Policy) -> None:
 
 
 def load_policy(folder: str | os.PathLike[str]) -> Policy:
-    """Load the policy that `save_policy` or `levelproof clone` wrote.
+    """Load a policy that `save_policy`, or `levelproof clone`, `train` or `distill`, wrote.
 
     Args:
         folder: the policy's folder; `builtin:s` and `builtin:m` name those that come with levelproof.

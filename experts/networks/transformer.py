@@ -1,8 +1,8 @@
 """The reference's transformer: gated attention among bodies, and messages along joints and from thrusters.
 
-With width 128, 2 blocks and 8 heads it has the shape of `tf-paper`, without the value head. A quarter of the heads each
-lets a body attend to all bodies, to those it is chained to, to those it is joined to, and to those it touches. Lanes
-come first within, because its attention is that of flax.
+With width 128, 2 blocks and 8 heads it has the shape of `tf-paper`, without the value head. Each quarter of the heads
+has a mask of its own: all bodies, those in the same chain of joints, those joined directly, those in contact. Inside,
+lanes come first, because the attention is Flax's.
 Facts: `kinetix.models.transformer_model` 3.0.2.
 """
 

@@ -1,7 +1,8 @@
 """Continuous batching: a fixed number of slots, each training or evaluating an expert.
 
 One compiled program, `advance`, advances every slot by a rollout. A level's result depends on the level, its id and the
-configuration alone: not on its slot, its neighbours or its time of entry. `slots.Mode` draws a slot's states.
+configuration alone: not on its slot, its neighbours or its time of entry. `slots.Mode` has a diagram of the states of a
+slot.
 
 An evaluation interrupts the training of its slot and leaves no trace in it.
 """

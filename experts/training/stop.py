@@ -20,7 +20,7 @@ class StopRules(NamedTuple):
     halves: np.bool_  # there are rungs
     enough: np.int32  # attempts that must succeed
     share: np.float32  # share of finished episodes that must reach the goal to trigger an evaluation
-    wait: np.int32  # updates between a failed evaluation and the next; doubles each time
+    wait: np.int32  # updates between a failed evaluation and the next; doubles up to six times
     polish: np.int32  # updates after the level is solved
     robustness: np.int32  # updates after the level is solved by fragile witnesses
     first_rung: np.int32  # updates at the first rung

@@ -1,1 +1,1 @@
-"""Training of policies on splits."""
+"""Policies for all levels: cloning, reinforcement, teachers, and evaluation."""

@@ -111,12 +111,12 @@ def source_of(split: Path, config: CloneConfig, tell: Callable[[str], None]) -> 
 
 
 def size_for(sources: Sequence[PartedSplit], config: CloneConfig) -> Size:
-    """Return the size that the network is made for. Raise UserError if it fits one and there are several."""
+    """Return the size to initialise the network for. Raise UserError if it fits one, and the splits have several."""
     sizes = list(dict.fromkeys(source.data.size for source in sources))
     if len(sizes) > 1 and config.network.kind is PolicyKind.FLAT:
         names = ", ".join(map(name_of, sizes))
         raise UserError(f"network.kind=flat fits levels of one size, not of {names}: use attention or invariant.")
-    # Parameters that fit any size need one of every kind of entity to be made for
+    # A level with an entity of every kind initialises all parameters of a network that fits any size
     return sizes[0] if config.network.kind is PolicyKind.FLAT else Size(5, 1, 1, 1)
 
 
@@ -131,7 +131,7 @@ def note_of(sources: Sequence[PartedSplit], config: CloneConfig) -> dict[str, An
 
 
 def keep(out: Path, state: Imitation, config: CloneConfig, size: Size, note: dict[str, Any]) -> None:
-    """Write the policy, then the checkpoint."""
+    """Write the checkpoint, then the policy."""
     fits = size if config.network.kind is PolicyKind.FLAT else None
     keep_run(out, Policy(config.network, state.average, fits, note | {"updates": int(state.updates)}), state)
 

@@ -83,10 +83,12 @@ def evaluate(
     facts, looked_at = [], []
     if attempts is None:
         attempts = PROTOCOLS[on].attempts if on in PROTOCOLS else ATTEMPTS
-    for group in _groups(on, where, sizes, count, starts, partial(say, console)):
+    groups = [*_groups(on, where, sizes, count, starts, partial(say, console))]
+    for group in groups:  # refuse before anything is played
         for each in contestants:
             if each.policy:
                 require_size(each.policy, group.levels.size, group.name, "choose others with --on or --size")
+    for group in groups:
         own = _own_experts(group, on, experts, attempts)
         facts.append(_measured(group, entrants, own, [each.main for each in contestants], attempts, seed, console))
         for each in contestants:
@@ -259,7 +261,7 @@ def _print(facts: dict[str, Any], attempts: int, console: Console) -> None:
         console.print(table)
         if apart := facts.get("difference", {}).get(title):
             low, high = (f"{100 * x:+.1f}" for x in apart["interval"])
-            say_difference = f"policy less other, one attempt, level by level: {100 * apart['rate']:+.1f} points"
+            say_difference = f"policy minus other, one attempt, level by level: {100 * apart['rate']:+.1f} points"
             console.print(f"{say_difference} ({low} to {high})")
         console.print()
 

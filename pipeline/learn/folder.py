@@ -8,6 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
+import jax
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from safetensors.numpy import load, save
@@ -33,7 +35,7 @@ def made(out: Path) -> Path:
 def require_same_run(out: Path, note: dict[str, Any], free: Sequence[str] = ()) -> None:
     """Raise UserError if `out` holds a run of other settings or data, or a policy of unknown origin.
 
-    `free` is the path, name by name, of a value in the note that may differ.
+    `free` is the path, as keys, of the value in the note that may differ.
     """
     if (before := note_in(out)) is None:
         if (out / CONFIG).exists():
@@ -43,7 +45,7 @@ def require_same_run(out: Path, note: dict[str, Any], free: Sequence[str] = ()) 
 
 
 def _without(note: Any, path: Sequence[str]) -> Any:
-    """Return JSON without the value at a path of names; as it is if it has none, as in another command's note."""
+    """Return JSON without the value at a path of keys; unchanged if it has none, as in another command's note."""
     if not path or not isinstance(note, dict):
         return note
     name, *inner = path
@@ -67,10 +69,17 @@ def write_note(out: Path, note: dict[str, Any]) -> None:
 
 
 def continued(out: Path, fresh: T) -> T:
-    """Return the state, a pytree, in the checkpoint of `out`, or `fresh` if it has none."""
+    """Return the state, a pytree, in the checkpoint of `out`, or `fresh` if the run has saved nothing yet.
+
+    Raises:
+        UserError: `out` has a policy but no checkpoint, and a new run would overwrite it.
+        Failure: the checkpoint is damaged.
+    """
     try:
         return unnamed(fresh, load(read_regular(out / CHECKPOINT)))
     except FileNotFoundError:
+        if (out / CONFIG).exists():
+            raise UserError(f"{out} has a policy, but no {CHECKPOINT}: put it back, or choose another -o.") from None
         return fresh
     except NotRegular:
         raise
@@ -84,7 +93,7 @@ def weights_digest(policy: str) -> str | None:
 
 
 def require_finite(loss: float, setting: str) -> None:
-    """Raise Failure if a loss is not finite: the weights then are not either, and must not replace the checkpoint."""
+    """Raise Failure if a loss is not finite, so that diverged weights do not replace the checkpoint."""
     if not math.isfinite(loss):
         raise Failure(
             f"The loss is {loss}, so the weights have diverged: start again with a smaller {setting} and another -o "
@@ -93,9 +102,18 @@ def require_finite(loss: float, setting: str) -> None:
 
 
 def keep_run(out: Path, policy: Policy, state: Any) -> None:
-    """Write the policy, then the checkpoint."""
-    save_policy(out, policy)
+    """Write the checkpoint, then the policy, so that a stopped run never has a policy without a checkpoint.
+
+    Raises:
+        Failure: the weights are not finite, and nothing was written.
+    """
+    if not all(np.isfinite(x).all() for x in jax.tree.leaves(policy.params)):
+        raise Failure(
+            "The weights have diverged: start again with a smaller learning rate and another -o (no checkpoint was "
+            "overwritten)."
+        )
     write(out / CHECKPOINT, save(named(state)))
+    save_policy(out, policy)
 
 
 @contextmanager

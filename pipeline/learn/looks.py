@@ -5,21 +5,20 @@ how often it was measured on them.
 """
 
 import json
+import os
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from levelproof.pipeline.store.disk import NotRegular, read_regular
-from levelproof.pipeline.store.files import write
+from levelproof.pipeline.store.disk import NotRegular, read_regular, regular
 
 LOOKS = "looks.jsonl"
 SEALED = "sealed"  # name of the sealed levels, and title of those among other levels
 
 
 def log_look(looks: Path, player: str, groups: Sequence[Mapping[str, Any]], attempts: int, seed: int) -> int | None:
-    """Add a line to a policy's log; return how many it has. None: the file cannot be written, and nothing was.
+    """Add a line to a policy's log; return the number of its lines, or None if it cannot be written.
 
     Args:
         looks: the log.
@@ -34,11 +33,11 @@ def log_look(looks: Path, player: str, groups: Sequence[Mapping[str, Any]], atte
         for sampled in [group["of"].get(SEALED, group["of"]["all"])[player]]  # of a split, only those that are sealed
     }
     look = {"at": datetime.now(UTC).isoformat(timespec="seconds"), "attempts": attempts, "seed": seed, "on": rates}
-    before = b""
     try:
-        with suppress(FileNotFoundError):
-            before = read_regular(looks)
-        write(looks, before + json.dumps(look).encode() + b"\n")
+        with open(looks, "a+b", opener=regular) as file:  # other evaluations may append at the same time
+            file.seek(max(0, file.seek(0, os.SEEK_END) - 1))
+            cut_off = file.read(1) not in (b"", b"\n")  # an earlier line, by a full disk
+            file.write(b"\n" * cut_off + json.dumps(look).encode() + b"\n")
+        return read_regular(looks).count(b"\n")
     except (OSError, NotRegular):
         return None
-    return before.count(b"\n") + 1

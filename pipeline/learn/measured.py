@@ -23,8 +23,8 @@ from levelproof.pipeline.read.level_files import levels_at, levels_below
 from levelproof.pipeline.read.levels import COLUMNS, levels_of, rules_of
 from levelproof.pipeline.read.select import columns_in, select
 from levelproof.pipeline.store.job_note import sound_note
-from levelproof.pipeline.store.manifest import fragment_paths, require_manifest
-from levelproof.pipeline.store.remote import is_remote
+from levelproof.pipeline.store.manifest import fragment_paths, require_manifest, splits_below
+from levelproof.pipeline.store.remote import as_typed, is_remote
 from levelproof.pipeline.store.seed.file import is_seed
 
 AT_ONCE = 256  # witnesses per read
@@ -92,6 +92,8 @@ def levels_in(
     try:
         listing = levels_below(place, JobConfig(level_files=str(place)))
     except UserError:
+        if splits_below(place):
+            require_manifest(place, [])  # raises: it holds several splits
         raise UserError(f"There are no levels at {place}: name a split, a level file or a folder of them.") from None
     if not listing.levels:
         raise UserError(listing.refused[0])
@@ -113,7 +115,7 @@ def _of_split(split: Path, where: str | None, count: int | None) -> MeasuredLeve
         )
     levels, labels = levels_of(manifest, rows), rows["label"].to_pylist()
     solved = np.array([label == Label.SOLVED for label in labels])
-    name = f"{split}, {name_of(levels.size)}"
+    name = f"{as_typed(split)}, {name_of(levels.size)}"
     return MeasuredLevels(name, rows["level_id"].to_numpy(), levels, rules_of(manifest), solved)
 
 
@@ -132,7 +134,7 @@ def midway_levels(split: Path, where: str | None, count: int | None, start: floa
     at = (steps.take(pa.array(witnessed)).to_numpy() * start).astype(np.int64)
     parts = [data.state(witnessed[i : i + AT_ONCE], at[i : i + AT_ONCE]).level for i in range(0, len(at), AT_ONCE)]
     levels = jax.tree.map(lambda *xs: np.moveaxis(np.concatenate(xs), 0, -1), *parts)
-    name = f"{split}, {name_of(data.size)}, {start:.0%} into witnesses"
+    name = f"{as_typed(split)}, {name_of(data.size)}, {start:.0%} into witnesses"
     solved = np.array([label == Label.SOLVED for label in data.manifest["label"].take(pa.array(witnessed)).to_pylist()])
     ids = data.manifest["level_id"].to_numpy()[witnessed]
     return MeasuredLevels(name, ids, levels, data.rules, solved, start)

@@ -35,13 +35,13 @@ class Metrics:
         """Open the metrics files of a run in `folder`; drop lines whose `curves.step` is beyond `steps`.
 
         Args:
-            folder: the run's, which another process may make again.
+            folder: folder of the run; another process may recreate it.
             curves: what to draw.
             log: name of a logger, or none.
-            settings: for the logger.
+            settings: settings of the run, for the logger.
             steps: of the checkpoint that the run continues.
-            say: tells the user a sentence.
-            require_ours: raises if another process has made the folder again.
+            say: reports a sentence to the user.
+            require_ours: raises if another process has recreated the folder.
 
         Raises:
             UserError: the logger's library is missing, or a link or the like has the name of a file.

@@ -4,7 +4,7 @@ So a run that was killed continues with the same batches, without a position to 
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -127,15 +127,20 @@ class Feed:
         with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as drawer:
             turn = self._turn(first)
             pools = self._read(turn)
-            coming = reader.submit(self._read, turn + 1) if self._changes else None
+            coming = self._ahead(reader, turn)
             ahead = drawer.submit(self._draw, pools, first)
             for update in range(first, config.train.updates):
                 now = ahead.result()
                 if (after := self._turn(update + 1)) != turn and coming and update + 1 < config.train.updates:
                     turn, pools = after, coming.result()
-                    coming = reader.submit(self._read, turn + 1)
+                    coming = self._ahead(reader, turn)
                 ahead = drawer.submit(self._draw, pools, update + 1)
                 yield now
+
+    def _ahead(self, reader: ThreadPoolExecutor, turn: int) -> Future[list[LevelPool]] | None:
+        """Start to read the pools of the next turn; None: no update needs them."""
+        needed = self._changes and (turn + 1) * self._config.refresh < self._config.train.updates
+        return reader.submit(self._read, turn + 1) if needed else None
 
     @property
     def _changes(self) -> bool:
@@ -160,7 +165,7 @@ class Feed:
 
 
 def validation_batches(source: PartedSplit, config: CloneConfig) -> list[Transitions]:
-    """Return whole batches of transitions of a split's validation levels, the same in every run."""
+    """Return whole batches of transitions of a split's validation levels, equal in runs of equal seed."""
     rng = np.random.default_rng(config.seed)
     chosen = rng.permutation(source.validation)[:VALIDATED]
     pool = read_pool(source.data, chosen, config.network, config.episodes == "all")

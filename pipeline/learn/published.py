@@ -92,6 +92,8 @@ def handmade_folder(say: Callable[[str], None] = print) -> Path:
         unpacked = Path(temporary) / "kinetix" / "levels"
         if not _is_whole(unpacked):
             raise Failure(f"The package {PACKAGE} lacks some of the handmade levels: use another package index.")
+        if _is_whole(folder):  # another process was faster
+            return folder
         shutil.rmtree(folder, ignore_errors=True)
         unpacked.rename(folder)
     return folder

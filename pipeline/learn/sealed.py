@@ -34,12 +34,12 @@ class KnownSealed(NamedTuple):
     """What is known of the sealed levels of a size, in the order of their ids."""
 
     solved: Bool[np.ndarray, " level"]  # labelled solved at the largest budget
-    successes: dict[str, Int[np.ndarray, " level"]]  # by budget: how many of its 16 attempts a level's expert solved
+    successes: dict[str, Int[np.ndarray, " level"]]  # by budget: successes of a level's expert in 16 attempts
 
 
 @cache
 def known_sealed(size: str) -> KnownSealed | None:
-    """Return labels and experts' successes of the sealed levels of a size; None if nobody has labelled them yet."""
+    """Return labels and experts' successes of the sealed levels of a size; None if they have no labels."""
     of_size = json.loads(Path(__file__).with_name(KNOWN).read_text())["sizes"].get(size)
     if of_size is None:
         return None

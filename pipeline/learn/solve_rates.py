@@ -38,9 +38,9 @@ def solve_rates(solved: Solved, env_steps: Int[np.ndarray, "level attempt"] | No
 def difference(ours: Solved, theirs: Solved) -> dict[str, Any]:
     """Return by how much one player's solve rate exceeds another's on the same levels, with a 95% interval.
 
-    The interval is normal in the differences level by level, of which there are two more, 1 and -1, for the same reason
-    as in `interval`. It is narrower than the players' own intervals, because both find the same levels hard. Attempts
-    of the two at a level need not be equally many.
+    The interval is normal in the differences level by level, to which 1 and -1 are added for the reason in `interval`.
+    It is narrower than the players' own intervals, because both find the same levels hard. The two may have different
+    numbers of attempts.
     """
     apart: Float[np.ndarray, " level"] = np.mean(ours, axis=1) - np.mean(theirs, axis=1)
     apart = np.concatenate([apart, (-1.0, 1.0)])

@@ -21,7 +21,7 @@ class Specialists(NamedTuple):
     """The experts of a split."""
 
     name: str  # as shown to users
-    solved: Solved  # first episodes with sampled actions; an expert that was not needed or found nothing has none
+    solved: Solved  # first episodes with sampled actions; without a rate: all solved if the level is trivial, else none
 
 
 def specialists_of(split: Path, level_ids: Int[np.ndarray, " level"], attempts: int) -> Specialists:

@@ -85,6 +85,8 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
         fresh = programs.begin(table, params)
         learner = jax.tree.map(lambda x, like: jax.device_put(x, like.sharding), continued(out, fresh), fresh)
         steps = int(learner.updates) * config.ppo.steps_per_update
+        if int(learner.updates) > config.ppo.updates:  # a kill may leave the policy behind the checkpoint
+            raise UserError(f"{out} has {steps:,} env steps of training already: set a larger ppo.env_steps.")
         write_note(out, note)
         metrics, done = Metrics(out, COURSE, config.log, note, steps, tell, require_ours), False
 

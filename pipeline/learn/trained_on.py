@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from levelproof.configs.compose import distributions
+from levelproof.configs.errors import suggestion
 from levelproof.configs.train import CURRICULA, TrainConfig
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.identity.content import content_hashes
@@ -18,6 +19,7 @@ from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.learn.measured import MeasuredLevels, is_split, levels_in, midway_levels
 from levelproof.pipeline.learn.sealed import require_not_sealed, require_some_usable, without_sealed
+from levelproof.pipeline.store.remote import is_remote
 
 
 class TrainingLevels(NamedTuple):
@@ -39,6 +41,10 @@ def levels_for(config: TrainConfig, tell: Callable[[str], None]) -> TrainingLeve
     if config.levels in CURRICULA:
         return _random(config)
     place = Path(config.levels)
+    if not is_remote(place) and not place.exists() and (hint := suggestion(config.levels, CURRICULA)):
+        raise UserError(
+            f"There are no levels at {place}{hint}: set levels to one of {', '.join(CURRICULA)}, or to a path."
+        )
     split, groups = is_split(place), _groups(config, tell)
     if split:
         require_not_sealed(place, groups[0].level_ids)
@@ -54,7 +60,7 @@ def levels_for(config: TrainConfig, tell: Callable[[str], None]) -> TrainingLeve
 
 
 def _require_enough(config: TrainConfig, starts: int) -> None:
-    """Raise UserError if there are fewer levels, each start of one counted, than replay waits for."""
+    """Raise UserError if there are fewer start states than replay needs before it starts."""
     needed = config.replay.enough
     if config.choice == "replay" and starts < needed:
         raise UserError(

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import jax
@@ -123,7 +124,18 @@ def test_split_in_which_nothing_is_committed_is_named(tmp_path: Path) -> None:
     done = here(["evaluate", "--on", "data/128k/s", *ONCE], tmp_path)
     assert_refused(done, 2, "Nothing is committed in data/128k/s yet")
     done = here(["train", "levels=data/128k/s", "-o", "policy"], tmp_path)
-    assert_refused(done, 2, "Nothing is committed in data/128k/s yet")
+    assert_refused(done, 2, "Nothing is committed in data/128k/s yet: `levelproof status data/128k/s` shows")
+
+
+def test_folder_of_splits_is_named(split: Path, tmp_path: Path) -> None:
+    """Its JSON files are those of the splits, not levels."""
+    shutil.copytree(split, tmp_path / "data/128k/s")
+    for words in (["evaluate", "--on", "data", *ONCE], ["train", "levels=data", "-o", "policy"]):
+        assert_refused(here(words, tmp_path), 2, "data is not a split, but a folder of 1")
+    done = here(["inspect", "data/128k/s", "--against", "data"], tmp_path)
+    assert_refused(done, 2, "data is not a split, but a folder of 1")
+    done = here(["train", "levels=learnabilty", "-o", "policy"], tmp_path)
+    assert_refused(done, 2, "no levels at learnabilty (did you mean learnability?)")
 
 
 @pytest.mark.parametrize(
@@ -133,6 +145,7 @@ def test_split_in_which_nothing_is_committed_is_named(tmp_path: Path) -> None:
         (["--where", "label = 'solved'"], "name one with --on"),
         (["--attempts", "0"], "--attempts is 0"),
         (["--size", "huge"], "set --size to s, m or l"),
+        (["--size", "s", "huge"], "set --size to s, m or l"),
         (["--on", "nowhere"], "There are no levels at nowhere"),
         (["--on", "nowhere", "--size", "s"], "--size selects"),
         (["--on", "handmade", "--size", "8-8-8-4"], "set --size to s, m or l"),
@@ -167,7 +180,7 @@ def test_policies_are_compared_on_the_same_levels_and_both_looks_are_logged(tmp_
             f"{split}, s": {"levels": 16, "solved": same["of"]["sealed"]["agent"]["once"]["rate"]}
         }
     done = here(["evaluate", "one.py", "--against", "three.py", "--levels", "32", "--attempts", "2"], tmp_path)
-    assert re.search(r"policy less other, one attempt, level by level: [+-]\d+\.\d points \([+-]", done.stdout)
+    assert re.search(r"policy minus other, one attempt, level by level: [+-]\d+\.\d points \([+-]", done.stdout)
     assert not (tmp_path / f"three.{LOOKS}").read_text().count("\n") > 1
 
 

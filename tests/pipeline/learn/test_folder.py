@@ -1,0 +1,48 @@
+"""The folder of a run: what is never overwritten."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import levelproof
+from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.learn.folder import CHECKPOINT, continued, keep_run
+
+STATE = {"step": np.int32(3)}
+
+
+def test_policy_without_its_checkpoint_is_not_begun_again(tmp_path: Path) -> None:
+    assert continued(tmp_path, STATE) is STATE
+    keep_run(tmp_path, levelproof.load_policy("builtin:s"), STATE)
+    assert continued(tmp_path, {"step": np.int32(0)}) == STATE
+    (tmp_path / CHECKPOINT).unlink()
+    with pytest.raises(UserError, match=f"has a policy, but no {CHECKPOINT}: put it back"):
+        continued(tmp_path, STATE)
+
+
+def test_checkpoint_is_written_before_the_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("levelproof.pipeline.learn.folder.save_policy", killed)
+    with pytest.raises(KeyboardInterrupt):
+        keep_run(tmp_path, levelproof.load_policy("builtin:s"), STATE)
+    assert continued(tmp_path, {"step": np.int32(0)}) == STATE
+
+
+def test_weights_that_are_not_finite_replace_nothing(tmp_path: Path) -> None:
+    policy = levelproof.load_policy("builtin:s")
+    diverged = replace(policy, params=jax.tree.map(lambda x: x * np.nan, policy.params))
+    with pytest.raises(Failure, match="The weights have diverged"):
+        keep_run(tmp_path, diverged, STATE)
+    assert list(tmp_path.iterdir()) == []
+    keep_run(tmp_path, policy, STATE)
+    before = shutil.copytree(tmp_path, tmp_path.with_name("before"))
+    with pytest.raises(Failure, match="no checkpoint was overwritten"):
+        keep_run(tmp_path, diverged, STATE)
+    for path in before.iterdir():
+        assert (tmp_path / path.name).read_bytes() == path.read_bytes()
