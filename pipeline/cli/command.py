@@ -10,8 +10,8 @@ EXITS = "exit codes: 0 done, 1 failed, 2 change the command,\n            3 some
 SPLIT = "folder or URL of a split, such as data/128k/s or s3://bucket/data/128k/s"
 
 
-def add_split(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("split", type=Path, metavar="SPLIT", help=SPLIT)
+def add_split(parser: argparse.ArgumentParser, optional: bool = False) -> None:
+    parser.add_argument("split", type=Path, metavar="SPLIT", help=SPLIT, nargs="?" if optional else None)
 
 
 def add_out(parser: argparse.ArgumentParser, default: str, kinds: str = "") -> None:

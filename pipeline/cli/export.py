@@ -14,7 +14,7 @@ levelproof export data/128k/s --format kinetix -o k    a dataset that Kinetix' r
 levelproof export data/128k/s --format kinetix -o k --where "steps_to_goal < 64"
 levelproof export data/128k/s --format minari -o m     a dataset for offline RL
 levelproof export data/128k/s --format parquet -o t    a table of levels and manifest
-levelproof export data/128k/s --format seed -o s.parquet    14 to 24 bytes per solved level
+levelproof export data/128k/s --format seed -o s.parquet    14 to 37 bytes per solved level
 levelproof export manifests/256k/s-handmade --format seed --levels handmade -o handmade.parquet"""
 JSON = "json"  # for one level; the other formats take a split
 WHERE = (
@@ -75,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--levels", metavar="FOLDER",
         help="level files of the levels that a seed file lacks; `handmade`: those of the reference, "
-        "whatever folder has that name",
+        "even if a folder has that name",
     )  # fmt: skip
     parser.add_argument("-o", "--out", type=Path, help=f"file or folder to write (default for {JSON}: level.json)")
 

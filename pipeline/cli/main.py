@@ -63,9 +63,9 @@ def _taken(arguments: argparse.Namespace, unknown: list[str]) -> list[str]:
     """Assign positional arguments that argparse leaves over because they follow an option; return the unknown ones."""
     if any(word.startswith("-") for word in unknown):
         return unknown
-    for name in ("words", "settings"):
+    for name, kind in {"words": str, "settings": str, "splits": Path}.items():
         if hasattr(arguments, name):
-            setattr(arguments, name, [*getattr(arguments, name), *unknown])
+            setattr(arguments, name, [*getattr(arguments, name), *map(kind, unknown)])
             return []
     if len(unknown) == 1 and unknown[0].isdecimal() and getattr(arguments, "level_id", 0) is None:
         arguments.level_id = int(unknown[0])
@@ -77,6 +77,8 @@ def _no_option(word: str, takes_settings: bool) -> str:
     """Return the error for an argument that the command does not have."""
     if not word.startswith("-"):
         return f"There is no argument {word}: --help lists them."
+    if word == "--debug":
+        return "--debug comes after the command, as in levelproof generate --debug."
     advice = "write settings as NAME=VALUE, as in size=m" if takes_settings else "--help lists the options"
     return f"There is no option {word}: {advice}."
 
@@ -99,7 +101,7 @@ def _report(sentence: str, code: int) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="levelproof",
-        description="Make physics levels, train an expert on each, and keep its verified solutions.",
+        description="Make physics levels, search each for a solution, train an expert on it, keep what is verified.",
         epilog=f"Start with: levelproof generate\n{EXITS}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -11,7 +11,7 @@ levelproof play data/128k/s 7 --policy policy/"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    source = "folder of a split, or a level file, such as level.json (default: an empty level)"
+    source = "folder or URL of a split, a seed file, or a level file such as level.json (default: an empty level)"
     parser.add_argument("source", type=Path, nargs="?", metavar="SOURCE", help=source)
     parser.add_argument("level_id", type=int, nargs="?", metavar="LEVEL_ID", help="id of a level of the split")
     parser.add_argument("--size", help="size of an empty level (default: m)")

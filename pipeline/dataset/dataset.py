@@ -268,8 +268,9 @@ class Dataset:
     ) -> Batches[EpisodeBatch]:
         """Iterate over batches of first episodes, which threads prefetch, many batches at once.
 
-        Takes the arguments of `batches`, and raises what it raises. `mask` is False in padding. Without `prefetch`,
-        two loads per core are read ahead, each of about a thousand episodes, or of one batch with pixels.
+        Takes the arguments of `batches` except `length`, and raises what it raises. `mask` is False in padding.
+        Without `prefetch`, two loads per core are read ahead, each of about a thousand episodes, or of one batch with
+        pixels.
         """
         indices, fields, kind = self._subset(subset), expand_fields(fields, self.size), parse_observation(observation)
         order = EpochOrder(len(indices), batch_size, seed, process_index, process_count)
@@ -293,8 +294,9 @@ class Dataset:
     ) -> TrajectorySource:
         """Return single trajectories or windows, as a data source for grain or a dataset for a torch DataLoader.
 
-        Takes the arguments of `batches`. Elements are dictionaries of numpy arrays [time, ...]: the attributes of
-        `Batch`, and the fields. Observations of several arrays (`pixels`, `symbolic_entity`) are dictionaries, too.
+        Its arguments are as in `batches`; order and batches are the loader's. Elements are dictionaries of numpy
+        arrays [time, ...]: the attributes of `Batch`, and the fields. Observations of several arrays (`pixels`,
+        `symbolic_entity`) are dictionaries, too.
 
         Raises:
             UserError: an argument is invalid, or the subset is empty.

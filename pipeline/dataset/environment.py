@@ -4,8 +4,6 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-import jax
-
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.sampling.distribution import Distribution
 from levelproof.levelgen.sampling.sampler import Sampler, sampler
@@ -93,9 +91,8 @@ def _of_split(
         raise UserError(
             f"The split {split} has no level for which {where} holds: `levelproof inspect {split}` shows its levels."
         )
-    # Initialise JAX with the caller's settings, before `levels_of` would limit it to one thread, as for a worker
-    jax.devices()
-    env, params = environment.make(levels_of(manifest, rows), *kinds, rules or rules_of(manifest), *resets)
+    levels = levels_of(manifest, rows, in_command=False)
+    env, params = environment.make(levels, *kinds, rules or rules_of(manifest), *resets)
     return replace(env, level_ids=rows["level_id"].to_numpy()), params
 
 

@@ -15,8 +15,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.read.level_files import level_file_paths
 from levelproof.pipeline.store.columns import COLUMNS
-from levelproof.pipeline.store.manifest import require_manifest
+from levelproof.pipeline.store.layout import MANIFEST
+from levelproof.pipeline.store.manifest import require_manifest, splits_below
 from levelproof.pipeline.store.seed.file import is_seed
 
 COMPARED = ("content_hash", "signature")
@@ -115,9 +117,11 @@ def comparison_of_source(source: Path) -> pa.Table:
     """
     if source.is_file() and not is_seed(source):
         return _of_files([source])
-    if not source.is_dir() or (source / "manifest").is_dir() or is_seed(source):
+    if not source.is_dir() or (source / MANIFEST).is_dir() or is_seed(source):
         return comparison_table(require_manifest(source, COMPARED).table)
-    if not (files := sorted(source.rglob("*.json"))):
+    if not (files := level_file_paths(source)):
+        if splits_below(source):
+            require_manifest(source, [])  # raises: it holds several splits
         raise UserError(f"{source} has neither a split nor a level file: give a folder that has one.")
     return _of_files(files)
 

@@ -76,7 +76,7 @@ def film_of(source: Path, level_id: int | None, plays: bool = True) -> Film:
         file = level_file(source, level_id)
         size = name_of(file.level.size)
         caption = Caption(f"{' '.join(source.stem.split())} · size {size}")
-        description = f"{source.name}, a level of size {size}: a level file has no witness"
+        description = f"{source.name}, a level of size {size}: no witness of a level file is shown"
         return _without_witness(file.level, file.rules, caption, description, plays)
     if level_id is None:
         raise UserError(f"Which level of {source}? Add its id, such as {require_manifest(source, []).level_ids[0]}.")

@@ -144,10 +144,12 @@
       const remove = () => { this.stage.selected = null; this.edit("delete", kind, number); };
       if (!scenery) this.remove = this.button("Delete", remove);
       if (kind !== "body") {
-        const { binding, fixed } = (kind === "joint" ? this.stage.world.joints : this.stage.world.thrusters)[index];
-        at("what").textContent = fixed ? "Fixed joint" : `${kind === "joint" ? "Motor" : "Thruster"}, obeys ${levelproof.entryName(binding)}`;
+        const { binding, fixed, motor, auto } = (kind === "joint" ? this.stage.world.joints : this.stage.world.thrusters)[index];
+        const obeys = kind === "thruster" || (motor && !auto);
+        const rest = fixed ? "Fixed joint" : motor ? "Motor that always runs" : "Joint without a motor";
+        at("what").textContent = obeys ? `${kind === "joint" ? "Motor" : "Thruster"}, obeys ${levelproof.entryName(binding)}` : rest;
         const next = (kind === "joint" ? binding : binding - 4) + 1;
-        at("deeds").replaceChildren(...(fixed ? [] : [this.button("Next control", () => this.edit("bind", kind, number, next))]), this.remove);
+        at("deeds").replaceChildren(...(obeys ? [this.button("Next control", () => this.edit("bind", kind, number, next))] : []), this.remove);
         return;
       }
       const [role, fixed] = [this.stage.world.bodies[index].role, this.level.fixed[index]];

@@ -6,7 +6,7 @@
   const at = (id) => document.getElementById(id);
   const STAGES = {
     compiling: "Loading the programs of this size; the first time takes a minute",
-    searching: "Random play and a search try for a first success",
+    searching: "A search looks for a first success",
     training: "The expert trains",
     stopped: "Stopped",
   };

@@ -3,6 +3,7 @@
 
 (function () {
   const { Link, Stage, Player, Editor, Expert } = window.levelproof;
+  const MAX_BYTES = 4e6; // of a level file; the server closes the connection at twice as many
   const at = (id) => document.getElementById(id);
   const stage = new Stage(at("stage"));
   const link = new Link((message) => expert.update(message));
@@ -48,6 +49,11 @@
   at("open").addEventListener("change", async (event) => {
     const [file] = event.target.files;
     if (!file) return;
+    if (file.size > MAX_BYTES) { // a much larger one would close the connection without a message
+      levelproof.problem(`${file.name} is larger than any level file: it has ${(file.size / 1e6).toFixed(1)} MB.`);
+      event.target.value = "";
+      return;
+    }
     try {
       await open("load", { document: JSON.parse(await file.text()) });
     } catch {

@@ -21,7 +21,8 @@
       at("attempt").addEventListener("click", () => this.attempt());
       addEventListener("keydown", (event) => this.key(event, true));
       addEventListener("keyup", (event) => this.key(event, false));
-      addEventListener("blur", () => this.held.clear());
+      addEventListener("blur", () => { for (const key of [...this.held]) this.release(key); });
+      levelproof.leaveAfterMouse(at("speed"));
     }
 
     open(level) {

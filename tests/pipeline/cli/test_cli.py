@@ -110,7 +110,12 @@ def test_invalid_command_prints_the_usage(capsys: pytest.CaptureFixture[str], ar
     [
         (["generate", "--size", "m"], "There is no option --size: write settings as NAME=VALUE, as in size=m"),
         (["inspect", "x", "--were", "a"], "There is no option --were: --help lists the options"),
+        (["--debug", "generate"], "--debug comes after the command, as in levelproof generate --debug"),
         (["show", "x", "-o", "y.svg", "z"], "There is no argument z: --help lists them"),
+        (["sample", "level_files=x"], "sample draws random levels"),
+        (["verify", "--repair"], "There is no split to verify"),
+        (["verify", "--repair", "executor=inline", "x"], "There is no split at x"),
+        (["verify", "--repair", "x", "y"], "Verify one split at a time: name one, not 2"),
         (["inspect", "x", "--csv", "--against", "y"], "--against has no effect with --csv: leave one of them out"),
         (["inspect", "x", "--plot", "y.svg", "--limit", "3"], "--limit has no effect with --plot"),
         (["play", "--size", "2-0-0-0"], "leave no room for the 4 polygons of the scenery"),
@@ -135,6 +140,8 @@ def test_arguments_may_follow_options(split: Path) -> None:
     """argparse leaves over those that are optional."""
     done = here(["export", "data/5k/s", "-o", "level.json", str(solved_level(split))], split.parents[2])
     assert done.returncode == 0, done.stderr
+    done = here(["card", "data/5k/s", "--license", "mit", "data/5k/s"], split.parents[2])
+    assert "There is no argument" not in done.stderr
     done = here(["plan", "size=s", "--json", "levels=six"], split.parents[2])
     assert_refused(done, 2, "write a whole number")
 

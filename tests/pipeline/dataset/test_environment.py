@@ -1,5 +1,6 @@
 """`levelproof.make` on the levels of a split."""
 
+import os
 from pathlib import Path
 
 import jax
@@ -19,6 +20,18 @@ def test_make_uses_all_levels_and_the_rules_of_a_split(split: Path) -> None:
     assert not table["shard"].is_valid().to_numpy().all(), "the split has no level without a witness: choose another"
     jax.tree.map(np.testing.assert_array_equal, params.levels, levelproof.sample_levels(ids, "s"))
     assert env.rules == levelproof.open(split).rules
+
+
+def test_make_leaves_the_settings_of_the_callers_process(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command limits JAX and NumPy to a thread; a program that calls `make` may train on all cores."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    jax.config.update("jax_default_matmul_precision", "highest")
+    try:
+        levelproof.make(split=split, where="shard IS NULL")
+        assert os.environ["OMP_NUM_THREADS"] == "7"
+        assert jax.config.values["jax_default_matmul_precision"] == "highest"
+    finally:
+        jax.config.update("jax_default_matmul_precision", None)
 
 
 def test_make_selects_levels_by_a_condition(split: Path) -> None:

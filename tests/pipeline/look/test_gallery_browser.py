@@ -192,6 +192,13 @@ def test_keys_work_after_a_button_and_in_capitals(page: Any, address: str, split
     page.locator("#trails").click()
     page.keyboard.press("Home")
     assert page.locator("#clock").inner_text().startswith("step 0 of ")
+    for press, step in (("", 0), ("pointerdown", steps)):  # a list that the mouse has not touched keeps the keys
+        page.locator("#speed").focus()
+        if press:
+            page.locator("#speed").dispatch_event(press)
+        page.select_option("#speed", "0.5" if press else "2")
+        page.keyboard.press("End")
+        assert page.locator("#clock").inner_text().startswith(f"step {step} of {steps} · ")
     page.keyboard.press("N")
     page.wait_for_selector(f"#title:not(:text('Level {solved(split)}'))")
 
@@ -251,6 +258,7 @@ def test_search_keyboard_and_back_navigation(page: Any, address: str) -> None:
     page.keyboard.press("Escape")
     page.wait_for_selector("#overview:visible")
     assert page.evaluate("scrollY") > 0  # scroll position restored
+    assert page.evaluate("document.activeElement.ariaLabel").startswith(f"Level {PLAYED - 2}, ")
     page.goto(f"{address}#level=12345")
     page.wait_for_selector("#problem:has-text('no level 12345')")
 

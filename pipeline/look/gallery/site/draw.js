@@ -47,7 +47,7 @@ window.levelproof = window.levelproof || {};
     }
     for (let i = 0; i < jointCount; i++) {
       const [body, anchor, kind, binding] = [next(), point(), next(), next()];
-      joints.push({ body, anchor, fixed: Boolean(kind & 1), motor: kind & 2 && !(kind & 1), auto: kind & 4, binding });
+      joints.push({ body, anchor, fixed: Boolean(kind & 1), motor: kind & 2 && !(kind & 1), auto: kind & 4, reversed: kind & 8, binding });
     }
     for (let i = 0; i < thrusterCount; i++) {
       thrusters.push({ body: next(), position: point(), angle: next() * ANGLE, binding: MOTORS + next() });
@@ -211,7 +211,8 @@ window.levelproof = window.levelproof || {};
   // 1: the motor turns body b counterclockwise relative to body a; -1: clockwise; 0: off.
   function turnOf(joint, action) {
     if (!action || !joint.motor) return 0;
-    return [0, 1, -1][joint.auto ? 1 : action[joint.binding]] || 0;
+    const forward = joint.reversed ? -1 : 1;
+    return [0, forward, -forward][joint.auto ? 1 : action[joint.binding]] || 0;
   }
 
   function drawJoint(context, joint, places, action, colours) {
@@ -314,7 +315,17 @@ window.levelproof = window.levelproof || {};
     return [(event.clientX - box.left) * scale - BORDER, SIDE + BORDER - (event.clientY - box.top) * scale];
   }
 
+  // Take the focus from a list once the mouse has chosen an entry: else it would take the page's keys. Whoever chooses by
+  // keyboard keeps it.
+  function leaveAfterMouse(list) {
+    let mouse = false;
+    list.addEventListener("pointerdown", () => { mouse = true; });
+    list.addEventListener("keydown", () => { mouse = false; });
+    list.addEventListener("change", () => { if (mouse) list.blur(); });
+  }
+
   Object.assign(window.levelproof, {
     bytesOf, worldOf, statesOf, between, liveEntries, entryName, coloursOf, attached, drawWorld, fit, metresOf,
+    leaveAfterMouse,
   });
 })();

@@ -19,6 +19,7 @@
       at("trails").addEventListener("change", () => this.draw());
       at("copy").addEventListener("click", () => this.copy("command", "copy"));
       at("copy-hands").addEventListener("click", () => this.copy("hands", "copy-hands"));
+      levelproof.leaveAfterMouse(at("speed"));
       addEventListener("keydown", (event) => this.key(event));
       const observer = new ResizeObserver(() => this.fit());
       for (const stage of ["stage", "policy-stage"]) observer.observe(at(stage));

@@ -81,6 +81,7 @@
     const id = address.match(/^#level=(-?\d+)$/);
     levelproof.report("");
     if (!id) {
+      const left = page.row;
       page.open(null);
       [at("overview").hidden, at("level").hidden] = [false, true];
       document.title = `${columns.about.split} · levelproof gallery`;
@@ -90,6 +91,7 @@
         refresh();
       } else grid.layout();
       scrollTo(0, scrolled);
+      if (left !== null && rows.length) grid.move(rows.indexOf(left)); // the focus goes to its cell, or to the first
       return;
     }
     const row = columns.numbers.get(Number(id[1]));
