@@ -78,15 +78,18 @@ def test_command_serves_a_level_until_ctrl_c(split: Path, tmp_path: Path) -> Non
     witness = stored.action[0, : np.argmax(stored.done[0]) + 1]
     words = ["play", str(split), str(data.manifest["level_id"][0].as_py()), "--no-browser", "--port", "0"]
     process = start(words, tmp_path, preexec_fn=heed_ctrl_c)
-    assert process.stdout is not None
-    line = process.stdout.readline()
-    found = re.search(r"http://\S+:\d+", line)
-    assert found, (line, process.communicate())
-    with connect(f"{found[0].replace('http', 'ws')}/socket", origin=Origin(found[0]), max_size=2**26) as page:
-        assert ask(page, "play")["actions"] == witness.tolist()
-        assert ask(page, "attempt")["actions"], "by the policy that comes with levelproof"
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=patience(ANSWER_SECONDS))
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        found = re.search(r"http://\S+:\d+", line)
+        assert found, (line, process.communicate())
+        with connect(f"{found[0].replace('http', 'ws')}/socket", origin=Origin(found[0]), max_size=2**26) as page:
+            assert ask(page, "play")["actions"] == witness.tolist()
+            assert ask(page, "attempt")["actions"], "by the policy that comes with levelproof"
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=patience(ANSWER_SECONDS))
+    finally:
+        process.kill()
     assert (process.returncode, err) == (0, "")
     assert "Done." in out
 

@@ -468,5 +468,5 @@ def test_forked_processes_are_refused(tmp_path: Path) -> None:
 
 def test_read_explains_missing_obstore(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "obstore", None)
-    with pytest.raises(UserError, match=r"pip install 'levelproof\[remote\]'"):
+    with pytest.raises(UserError, match=r'pip install -e "\.\[remote\]"'):
         read_manifest(S3)
