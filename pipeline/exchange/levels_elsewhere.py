@@ -18,6 +18,7 @@ from levelproof.levelgen.sampling.sampler import CHUNK
 from levelproof.physics.step import ENGINE_VERSION
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.exchange.seed import check_new_seed
+from levelproof.pipeline.read.level_files import level_file_paths
 from levelproof.pipeline.read.levels import writing_to
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store import files
@@ -85,7 +86,7 @@ def add_levels(seed: Path, folder: Path, out: Path) -> None:
 def _levels_below(folder: Path, size: str) -> dict[int, list[FoundLevel]]:
     """Map level ids to all level files of this size that contain the level, in path order."""
     found: dict[int, list[FoundLevel]] = {}
-    for path in sorted(folder.expanduser().absolute().rglob("*.json")):
+    for path in level_file_paths(folder.expanduser().absolute()):
         try:
             level = read_level_file(path).level
         except LevelFileError:  # perhaps another program's file; only missing levels are errors

@@ -84,10 +84,7 @@ def evaluate(
     if attempts is None:
         attempts = PROTOCOLS[on].attempts if on in PROTOCOLS else ATTEMPTS
     groups = [*_groups(on, where, sizes, count, starts, partial(say, console))]
-    for group in groups:  # refuse before anything is played
-        for each in contestants:
-            if each.policy:
-                require_size(each.policy, group.levels.size, group.name, "choose others with --on or --size")
+    _require_sizes(contestants, groups)  # before anything is played
     for group in groups:
         own = _own_experts(group, on, experts, attempts)
         facts.append(_measured(group, entrants, own, [each.main for each in contestants], attempts, seed, console))
@@ -109,6 +106,14 @@ def evaluate(
     print("In brackets: 95% intervals over levels.")
     if any(group["published"] for group in facts):
         print("sfl-paper, sfl-1m-envs: the reference's agents, with the rates that it published.")
+
+
+def _require_sizes(contestants: Sequence["_Contestant"], groups: Sequence[MeasuredLevels]) -> None:
+    """Raise UserError if a policy cannot play levels of a group's size."""
+    for group in groups:
+        for each in contestants:
+            if each.policy:
+                require_size(each.policy, group.levels.size, group.name, "choose others with --on or --size")
 
 
 def is_named(on: str) -> bool:

@@ -23,7 +23,7 @@ from levelproof.pipeline.read.level_files import levels_at, levels_below
 from levelproof.pipeline.read.levels import COLUMNS, levels_of, rules_of
 from levelproof.pipeline.read.select import columns_in, select
 from levelproof.pipeline.store.job_note import sound_note
-from levelproof.pipeline.store.manifest import fragment_paths, require_manifest, splits_below
+from levelproof.pipeline.store.manifest import fragment_paths, refuse_folder_of_splits, require_manifest
 from levelproof.pipeline.store.remote import as_typed, is_remote
 from levelproof.pipeline.store.seed.file import is_seed
 
@@ -92,8 +92,7 @@ def levels_in(
     try:
         listing = levels_below(place, JobConfig(level_files=str(place)))
     except UserError:
-        if splits_below(place):
-            require_manifest(place, [])  # raises: it holds several splits
+        refuse_folder_of_splits(place)
         raise UserError(f"There are no levels at {place}: name a split, a level file or a folder of them.") from None
     if not listing.levels:
         raise UserError(listing.refused[0])

@@ -19,7 +19,7 @@ from levelproof.experts.generalist.replay import replay
 from levelproof.experts.generalist.rollout import table_of
 from levelproof.experts.generalist.train import Learner, Programs, TrainingRecipe, UpdateFacts, programs_of
 from levelproof.experts.networks.over_levels import PolicyKind
-from levelproof.experts.networks.saved import CONFIG, Policy
+from levelproof.experts.networks.saved import Policy
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.sampling.sampler import Sampler
 from levelproof.levelgen.task.lanes import Table
@@ -78,14 +78,12 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
     params = None if start is None else start.params
     with explaining_writes(out), only_clone(made(out)) as require_ours:
         require_same_run(out, note, LATER)
-        if (before := trained_steps(out)) > config.ppo.updates * config.ppo.steps_per_update:
-            raise UserError(f"{out} has {before:,} env steps of training already: set a larger ppo.env_steps.")
         table = table_of(source.levels, recipe.rules)
         programs = programs_of(recipe, table, params, cores)
         fresh = programs.begin(table, params)
         learner = jax.tree.map(lambda x, like: jax.device_put(x, like.sharding), continued(out, fresh), fresh)
         steps = int(learner.updates) * config.ppo.steps_per_update
-        if int(learner.updates) > config.ppo.updates:  # a kill may leave the policy behind the checkpoint
+        if int(learner.updates) > config.ppo.updates:
             raise UserError(f"{out} has {steps:,} env steps of training already: set a larger ppo.env_steps.")
         write_note(out, note)
         metrics, done = Metrics(out, COURSE, config.log, note, steps, tell, require_ours), False
@@ -106,11 +104,6 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
             metrics.close(done)
         save(learner)
     tell(f"The policy is in {out}. Next: levelproof evaluate {out}")
-
-
-def trained_steps(out: Path) -> int:
-    """Return the env steps that the policy in a run's folder was trained for; 0 if it has none yet."""
-    return int(policy_at(out).origin["env_steps"]) if (out / CONFIG).exists() else 0
 
 
 def prepared_cores(config: TrainConfig, note: dict[str, Any] | None) -> int:

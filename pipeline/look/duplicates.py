@@ -18,7 +18,7 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.read.level_files import level_file_paths
 from levelproof.pipeline.store.columns import COLUMNS
 from levelproof.pipeline.store.layout import MANIFEST
-from levelproof.pipeline.store.manifest import require_manifest, splits_below
+from levelproof.pipeline.store.manifest import refuse_folder_of_splits, require_manifest
 from levelproof.pipeline.store.seed.file import is_seed
 
 COMPARED = ("content_hash", "signature")
@@ -120,8 +120,7 @@ def comparison_of_source(source: Path) -> pa.Table:
     if not source.is_dir() or (source / MANIFEST).is_dir() or is_seed(source):
         return comparison_table(require_manifest(source, COMPARED).table)
     if not (files := level_file_paths(source)):
-        if splits_below(source):
-            require_manifest(source, [])  # raises: it holds several splits
+        refuse_folder_of_splits(source)
         raise UserError(f"{source} has neither a split nor a level file: give a folder that has one.")
     return _of_files(files)
 

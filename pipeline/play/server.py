@@ -29,7 +29,7 @@ from levelproof.pipeline.play.training import train_level
 
 HOST = "127.0.0.1"
 PAGE = Path(__file__).parent / "page"
-SHARED = ("draw.js", "curve.js", "style.css")  # files shared with the gallery's pages
+SHARED = ("draw.js", "curve.js", "focus.js", "style.css")  # files shared with the gallery's pages
 PALETTE = "palette.css"
 MAX_BYTES = 8_000_000  # of a request, which may contain a level file
 SOCKET = "/socket"

@@ -72,8 +72,9 @@ def levels_below(folder: Path, job: JobConfig) -> Listing:
 
 def level_file_paths(folder: Path) -> list[Path]:
     """Return the JSON files below a folder, in order, without those of splits, which a job may have written there."""
-    splits = {note.parent for note in folder.rglob(JOB) if (note.parent / MANIFEST).is_dir()}
-    return sorted(path for path in folder.rglob("*.json") if splits.isdisjoint(path.parents))
+    paths = sorted(folder.rglob("*.json"))
+    splits = {path.parent for path in paths if path.name == JOB and (path.parent / MANIFEST).is_dir()}
+    return [path for path in paths if splits.isdisjoint(path.parents)]
 
 
 def _origin_of(path: Path, job: JobConfig) -> Origin:

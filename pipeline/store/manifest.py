@@ -355,18 +355,19 @@ def require_manifest(
     return manifest
 
 
-def splits_below(folder: Path) -> list[Path]:
-    """Return the splits that a local folder holds, up to two folders further down, as in `out=`; none of a URL."""
+def refuse_folder_of_splits(folder: Path) -> None:
+    """Raise UserError if a local folder holds splits, one to three folders further down; a URL may be any."""
     patterns = [] if is_remote(folder) else [f"{above}{MANIFEST}" for above in ("*/", "*/*/", "*/*/*/")]
-    return [path.parent for pattern in patterns for path in folder.glob(pattern)]
+    below = sorted(path.parent for pattern in patterns for path in folder.glob(pattern))
+    if below:
+        names = ", ".join(map(str, below[:MAX_SHOWN]))
+        raise UserError(f"{folder} is not a split, but a folder of {len(below)}: name one of them, such as {names}.")
 
 
 def _nothing_at(split: Path) -> str:
-    """Say in a sentence why a folder is not a split."""
+    """Say in a sentence why a folder is not a split; raise UserError if it holds some."""
     require_known(split)
-    if below := splits_below(split):
-        names = ", ".join(map(str, sorted(below)[:MAX_SHOWN]))
-        return f"{split} is not a split, but a folder of {len(below)}: name one of them, such as {names}."
+    refuse_folder_of_splits(split)
     if not is_remote(split) and (split / JOB).exists():
         return f"Nothing is committed in {split} yet: `levelproof status {split}` shows how far its job is."
     what = f"Nothing is committed in {split} yet" if split.is_dir() else f"There is no split at {split}"

@@ -12,15 +12,19 @@ pytestmark = pytest.mark.slow
 
 TINY = ("network.width=16", "network.depth=1")
 RUNS = {
-    "clone": ("SPLIT", "interval=20", "train.updates=200", "train.batch=128", "played=0", "validation=0.3", "pool=8"),
-    "train": ("levels=SPLIT", "interval=1", "cores=2", "ppo.environments=64", "ppo.minibatches=4"),
-    "distill": ("SPLIT", "interval=2", "train.updates=20", "train.batch=32", "episodes=8", "states=16", "buffer=64"),
-}
-MORE = {
-    "clone": ("refresh=7", "where="),
-    "train": ("ppo.horizon=32", f"ppo.env_steps={10 * 64 * 32}", "where=label = 'solved'"),
-    "distill": ("teachers.witness=2", "teachers.random=8", "teachers.learner=1"),
-}
+    "clone": (
+        "SPLIT", "where=", "interval=20", "train.updates=200", "train.batch=128", "played=0", "validation=0.3",
+        "pool=8", "refresh=7",
+    ),
+    "train": (
+        "levels=SPLIT", "where=label = 'solved'", "interval=1", "cores=2", "ppo.environments=64", "ppo.minibatches=4",
+        "ppo.horizon=32", f"ppo.env_steps={10 * 64 * 32}",
+    ),
+    "distill": (
+        "SPLIT", "interval=2", "train.updates=20", "train.batch=32", "episodes=8", "states=16", "buffer=64",
+        "teachers.witness=2", "teachers.random=8", "teachers.learner=1",
+    ),
+}  # fmt: skip
 LINES = 10  # of metrics, one beside each checkpoint
 TIMES = ("seconds", "per_second")  # ends of the names of metrics that no run repeats
 
@@ -28,7 +32,7 @@ TIMES = ("seconds", "per_second")  # ends of the names of metrics that no run re
 @pytest.mark.parametrize("command", RUNS)
 def test_run_that_was_killed_continues_bit_for_bit(command: str, split: Path, tmp_path: Path) -> None:
     words = [command, "-o", "policy", *(word.replace("SPLIT", str(split)) for word in RUNS[command])]
-    words += [*MORE[command], *TINY]
+    words += TINY
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     for folder in (whole, broken):
         folder.mkdir()

@@ -194,7 +194,7 @@ def test_server_refuses_other_origins_and_hosts(address: str) -> None:
         request = urllib.request.Request(address + path, headers={"Host": host} if host else {})
         with pytest.raises(urllib.error.HTTPError):
             urllib.request.urlopen(request)
-    for path in ("/", "/draw.js", "/curve.js", "/palette.css", "/main.js"):
+    for path in ("/", "/draw.js", "/curve.js", "/focus.js", "/palette.css", "/main.js"):
         assert urllib.request.urlopen(address + path).read()
 
 

@@ -315,17 +315,7 @@ window.levelproof = window.levelproof || {};
     return [(event.clientX - box.left) * scale - BORDER, SIDE + BORDER - (event.clientY - box.top) * scale];
   }
 
-  // Take the focus from a list once the mouse has chosen an entry: else it would take the page's keys. Whoever chooses by
-  // keyboard keeps it.
-  function leaveAfterMouse(list) {
-    let mouse = false;
-    list.addEventListener("pointerdown", () => { mouse = true; });
-    list.addEventListener("keydown", () => { mouse = false; });
-    list.addEventListener("change", () => { if (mouse) list.blur(); });
-  }
-
   Object.assign(window.levelproof, {
     bytesOf, worldOf, statesOf, between, liveEntries, entryName, coloursOf, attached, drawWorld, fit, metresOf,
-    leaveAfterMouse,
   });
 })();

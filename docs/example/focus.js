@@ -1,0 +1,1 @@
+../../pipeline/look/gallery/site/focus.js
