@@ -1,4 +1,4 @@
-"""Policies trained by reinforcement, from scratch and from `builtin:s`: what they solve, and at what cost.
+"""Policies trained by reinforcement learning, from scratch and from `builtin:s`: what they solve, and at what cost.
 
 A stopped run resumes: `levelproof train` resumes from its checkpoint, and the folder keeps finished evaluations.
 """
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> Report:
     head = ("policy", "env steps", "core-seconds", "of all", "of solved", "of solved, best of 8")
     given = f", with {' '.join(f'`{setting}`' for setting in args.set)}" if args.set else ""
     return Report(
-        "Policies trained by reinforcement",
+        "Policies trained by reinforcement learning",
         [*results, {"way": "start", "sealed": begun}],
         [Table(head, rows, "Share of sealed levels solved with sampled actions, one attempt; 95% intervals")],
         [

@@ -16,7 +16,7 @@ class CloneConfig:
     episodes: Literal["first", "all"] = "first"  # first: each record up to its first goal; all: whole records
     mirror: bool = False  # also learn from mirrored witnesses that solve their mirrored level
     validation: float = 0.1  # share of the levels that are kept from training, chosen by content hash
-    pool: int = 16_384  # levels that updates draw from, evenly; if the splits have more, as many are read ahead
+    pool: int = 16_384  # levels in memory, drawn evenly; if the splits have more, the next pool is read ahead
     refresh: int = 1000  # updates until other levels replace those in memory, if the splits have more
     interval: int = 500  # updates between validations, each with a checkpoint
     played: int = 256  # validation levels of each split that the policy plays, once each, at each validation
