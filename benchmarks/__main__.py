@@ -5,6 +5,7 @@ imported, so that `--help` answers at once.
 """
 
 import argparse
+import subprocess
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -52,9 +53,10 @@ BENCHMARKS = {  # name: (module, what it measures)
     "seeds": ("benchmarks.seeds", "bytes of seeds, and transitions/s read from them and from a disk"),
     "workers": ("benchmarks.workers", "how much faster two workers are than one, and what a thousand cost the driver"),
     "cloning": ("benchmarks.cloning", "how cloned policies solve unseen levels, against the number of levels"),
-    "learners": ("benchmarks.learners", "what policies trained by reinforcement solve, and at what cost"),
+    "learners": ("benchmarks.learners", "what policies trained by reinforcement learning solve, and at what cost"),
     "agents": ("benchmarks.agents", "how policies play the levels of the reference's published agents"),
     "cold": ("benchmarks.cold", "how long the first levels take with nothing compiled, and the next ones"),
+    "cost": ("benchmarks.cost", "what a solved level costs, and how many are solved, beside an earlier commit"),
     "readme": ("benchmarks.readme", "the README's commands in a fresh clone and environment"),
 }
 
@@ -71,6 +73,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (LevelproofError, ConfigError) as error:
         print(f"Error: {error}", file=sys.stderr)
         return getattr(error, "exit_code", Exit.INPUT)
+    except subprocess.CalledProcessError as error:
+        print(f"Error: {error}", file=sys.stderr)
+        return Exit.FAILED
     except KeyboardInterrupt:
         print("Stopped.", file=sys.stderr)
         return Exit.INTERRUPTED

@@ -14,6 +14,7 @@ from levelproof.experts.networks.saved import WEIGHTS, load_policy, policy_folde
 from levelproof.levelgen.level import SIZES
 from levelproof.pipeline.learn.evaluate import ALL
 from levelproof.pipeline.learn.published import HANDMADE, PROTOCOLS, RANDOM
+from levelproof.pipeline.read.policies import policy_at
 
 ENV_STEPS = {"sfl-paper": "18 billion, random l", "sfl-1m-envs": "376 billion, random m"}  # README of kinetix-env 3.0.2
 BASELINES = ("doing nothing", "random", "sticky random")
@@ -27,6 +28,8 @@ def register(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> Report:
+    for policy in args.policies:
+        policy_at(Path(policy))  # a wrong name fails before the reference writes levels
     args.folder.mkdir(parents=True, exist_ok=True)
     for size in args.sizes:
         write(size)

@@ -1,7 +1,7 @@
 """How well cloned policies solve levels they have never seen, against the number of levels they were cloned from.
 
-All policies see equally many transitions, whatever their number of levels, but those with twice the updates. A stopped
-run resumes: `levelproof clone` resumes from its checkpoint, and the folder keeps finished evaluations.
+All policies see equally many transitions, whatever their number of levels, except those with twice the updates. A
+stopped run resumes: `levelproof clone` resumes from its checkpoint, and the folder keeps finished evaluations.
 """
 
 import argparse
@@ -21,6 +21,7 @@ import numpy as np
 import levelproof
 from benchmarks.plotting import pyplot
 from benchmarks.report import Report, Table
+from levelproof.experts.networks.saved import WEIGHTS, policy_folder
 from levelproof.levelgen.level import name_of
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.learn.evaluate import ALL, SOLVED
@@ -127,9 +128,10 @@ def measured(args: argparse.Namespace, size: str, last: int, variant: str, count
 
 
 def kept(file: Path, policy: Path | str, *words: Any) -> dict[str, Any]:
-    """Return an evaluation's rates, from its file if an earlier run made it with the same arguments."""
-    told = hashlib.sha256(" ".join(map(str, words)).encode()).hexdigest()[:8]
-    file = file.with_stem(f"{file.stem}-{told}")
+    """Return an evaluation's rates, from its file if an earlier run made it with the same arguments and weights."""
+    weights = policy_folder(policy) / WEIGHTS  # an agent in a Python file has none
+    told = hashlib.sha256(" ".join(map(str, words)).encode() + (weights.read_bytes() if weights.exists() else b""))
+    file = file.with_stem(f"{file.stem}-{told.hexdigest()[:8]}")
     if not file.exists():
         file.write_text(command("evaluate", policy, *words, "--json"))
     return json.loads(file.read_text())["levels"][0]["of"]

@@ -1,4 +1,4 @@
-"""Learners at equal cost: reinforcement from scratch, against solved levels, a clone of them, and reinforcement of it.
+"""Learners at equal cost: RL from scratch, a clone of searched levels, and RL from that clone.
 
 Everything that a way needs counts as its core-seconds. A stopped run resumes, except in a search: every command
 continues what it left, training from its checkpoint, and the folder keeps finished evaluations.
@@ -78,11 +78,11 @@ def run(args: argparse.Namespace) -> Report:
         [Table(head, rows, f"Share of sealed levels of {args.size} solved with sampled actions; 95% intervals")],
         [
             f"Every policy has {args.core_seconds:,.0f} core-seconds of one core, with compiling, for all that it is "
-            f"made from: the search of {args.levels} levels (`procedure=label`, ids from {FIRST:,} on, for the next "
-            f"seed from {FIRST + BETWEEN_SEEDS:,}), the clone "
+            f"made from: the search of {args.levels} levels (`procedure=label`, ids from {FIRST:,} on, for the "
+            f"second seed from {FIRST + BETWEEN_SEEDS:,}), the clone "
             f"({', '.join((f'{args.updates:,} updates', *(f'`{each}`' for each in args.cloning)))}), and "
-            "reinforcement for the rest, on random levels unless a way says otherwise; those of builtin:s do not "
-            "count. *Of all*: "
+            "reinforcement learning for the rest, on random levels unless a way says otherwise; what builtin:s took "
+            "is not counted. *Of all*: "
             f"{players[ALL]['random']['levels']:,} levels, of which some cannot be solved; *of solved*, and the best "
             f"of 8 attempts at them: the {players[SOLVED]['random']['levels']:,} that are labelled solved.",
             *(f"{way}: `levelproof train {shown(settings_of(args, way, 0))}`." for way in args.ways),
@@ -117,7 +117,7 @@ def measuring(args: argparse.Namespace) -> Sequence[Any]:
 
 def cloned(args: argparse.Namespace, seed: int) -> tuple[Path, float]:
     """Search levels, and clone what solves them; return the policy, and the core-seconds of both."""
-    policy, search = args.folder / f"clone-{args.size}-{seed}", searched(args, seed)
+    policy, search = args.folder / f"clone-{args.size}-{args.levels}-{seed}", searched(args, seed)
     words = "network.width=64", f"train.updates={args.updates}", f"seed={seed}", *args.cloning
     command("clone", split_of(args, seed), "-o", policy, *words)
     return policy, search + lines_of(policy)[-1]["bc/core_seconds"]
@@ -156,7 +156,7 @@ def shown(words: Sequence[str]) -> str:
 
 def split_of(args: argparse.Namespace, seed: int) -> Path:
     """Return where the levels of a clone are."""
-    return args.folder / f"data-{args.size}-{seed}" / "16k" / args.size
+    return args.folder / f"data-{args.size}-{args.levels}-{seed}" / "16k" / args.size
 
 
 def trained(

@@ -34,6 +34,8 @@ def register(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Report:
     prepare_jax()
+    if args.sheets:
+        args.sheets.mkdir(parents=True, exist_ok=True)
     results = []
     for name, distribution in distributions().items():
         if args.sheets:
@@ -50,5 +52,5 @@ def run(args: argparse.Namespace) -> Report:
         title="Levels that need no expert, by distribution",
         results=results,
         tables=[Table(("distribution", *head), rows)],
-        notes=[f"Shares of {args.levels:,} levels a size and distribution."],
+        notes=[f"Shares of {args.levels:,} levels of each size and distribution."],
     )

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import levelproof
@@ -18,6 +19,7 @@ from benchmarks.report import Report, Table
 from levelproof.levelgen.identity.keys import FRESH_BITS
 from levelproof.levelgen.level import ACTIONS, SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.task.actions import CHOICES
 from levelproof.levelgen.task.lanes import Lanes
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.runtime import own_cores, prepare_jax
@@ -129,7 +131,7 @@ def in_lanes(env: Any, params: Any, lanes: int, count: int) -> tuple[Any, Turn]:
         def act(carry, key):
             state, played, over, total = carry
             acting, coming = jax.random.split(key)
-            action = jax.random.randint(acting, (ACTIONS, lanes), 0, 2)
+            action = jax.random.randint(acting, (ACTIONS, lanes), 0, jnp.array(CHOICES)[:, None])
             index = jax.random.randint(coming, (lanes,), 0, count)
             observation, state, played, _, done, _ = ours.step(table, played, state, action, index)
             return (state, played, over + done.sum(), total + observation.sum()), None

@@ -1,7 +1,7 @@
 """Networks of policies for all levels: clones at equal core-seconds, and the arithmetic that each update reaches.
 
-Every network clones the same levels for the same core-seconds of one core; how many updates that is, follows from its
-speed, measured first and kept. A stopped run resumes: `levelproof clone` from its checkpoint, and the folder keeps
+Every network clones the same levels for the same core-seconds of one core; its speed, measured first and kept, decides
+how many updates that is. A stopped run resumes: `levelproof clone` from its checkpoint, and the folder keeps
 finished evaluations.
 """
 

@@ -27,9 +27,10 @@ from benchmarks.report import Report, Table
 from levelproof.configs.compose import compose_job
 from levelproof.configs.numbers import parse_count
 from levelproof.experts.steps import Seconds
+from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.store.columns import COLUMNS, RENAMED
 from levelproof.pipeline.store.layout import new_attempt, split_path, unit_name
-from levelproof.pipeline.store.manifest import begin_fragment, write_fragment
+from levelproof.pipeline.store.manifest import begin_fragment, require_manifest, write_fragment
 from levelproof.pipeline.store.merge import FILE_BYTES
 from levelproof.pipeline.store.seal import ROWS
 
@@ -57,6 +58,8 @@ def run(args: argparse.Namespace) -> Report:
         split = split_path(str(folder), "128k", "s")
         if not split.exists():
             made_split(folder, levels)
+        elif (there := len(require_manifest(split, []).level_ids)) != levels:
+            raise UserError(f"{split} has {there:,} levels: pass --levels {there}, or another --split.")
         results = [
             measured(name, arguments, args.repeats) for name, arguments in commands(folder, split, levels).items()
         ]
@@ -66,6 +69,9 @@ def run(args: argparse.Namespace) -> Report:
         if not args.split:
             shutil.rmtree(folder)
     worst = [result["name"] for result in results if result["seconds"] > MAX_SECONDS or result["bytes"] > MAX_BYTES]
+    faults = [f"{', '.join(worst)}: more than {MAX_SECONDS} s or {MAX_BYTES / 2**20:,.0f} MiB."] if worst else []
+    if len(files) > MAX_FILES or entries > MAX_ENTRIES:
+        faults.append(f"More than {MAX_FILES:,} files, or {MAX_ENTRIES:,} entries in a folder.")
     head = ("command", "seconds", "core-seconds", "peak memory, MiB")
     numbers = lambda result: (
         f"{result['seconds']:.1f}",
@@ -82,7 +88,7 @@ def run(args: argparse.Namespace) -> Report:
             f"target is {MAX_SECONDS} s and {MAX_BYTES / 2**20:,.0f} MiB for each, {MAX_FILES:,} files, and "
             f"{MAX_ENTRIES:,} entries.",
         ],
-        fault=f"{', '.join(worst)}: more than {MAX_SECONDS} s or {MAX_BYTES / 2**20:,.0f} MiB." if worst else "",
+        fault=" ".join(faults),
     )
 
 
@@ -112,7 +118,7 @@ def measured(name: str, arguments: Sequence[str], repeats: int) -> dict[str, Any
         cores.append(usage.ru_utime + usage.ru_stime)
         memory.append(usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024))
         if process.returncode:
-            raise RuntimeError(f"{name} failed")
+            raise Failure(f"{name} fails with {process.returncode}.")
     return {"name": name, "seconds": max(seconds), "core_seconds": max(cores), "bytes": max(memory)}
 
 

@@ -62,8 +62,8 @@ def run(args: argparse.Namespace) -> Report:
         "bytes, sealed": f"{totals['bytes']:,}",
         "files, sealed": f"{totals['files']:,}",
         "maximum fragments": f"{max(sample['fragments'] for sample in samples):,}",
-        **{f"maximum memory of {kind}, MB": f"{value / 2**20:,.0f}" for kind, value in memory.items()},
-        "driver's memory, second half of generate, MB": " to ".join(
+        **{f"maximum memory of {kind}, MiB": f"{value / 2**20:,.0f}" for kind, value in memory.items()},
+        "driver's memory, second half of generate, MiB": " to ".join(
             f"{value / 2**20:,.0f}" for value in (half[0]["driver"], half[-1]["driver"])
         ),
     }
@@ -159,7 +159,7 @@ def draw(samples: Sequence[Mapping[str, Any]], file: Path) -> None:
     minutes = [(sample["time"] - samples[0]["time"]) / 60 for sample in samples]
     for kind, colour in COLOURS.items():
         left.plot(minutes, [sample[kind] / 2**30 for sample in samples], color=colour, label=kind)
-    left.set(xlabel="minutes", ylabel="memory, GB", ylim=0)
+    left.set(xlabel="minutes", ylabel="memory, GiB", ylim=0)
     right.plot(minutes, [sample["fragments"] for sample in samples], color="#009e73", label="fragments")
     right.plot(minutes, [sample["shards"] for sample in samples], color="#777777", label="shards")
     right.set(xlabel="minutes", ylabel="in the split", ylim=0)

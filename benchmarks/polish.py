@@ -71,8 +71,8 @@ def run(args: argparse.Namespace) -> Report:
             ),
         ],
         notes=[
-            f"Levels from id {args.first:,} on, experts of {BUDGET:,} env steps; counted are levels that the default "
-            "procedure solves and on which `procedure=masters` has a witness of its expert's own. *Polished*: the "
+            f"Levels from id {args.first:,} on, experts of {BUDGET:,} env steps; only levels count that the default "
+            "procedure solves and for which `procedure=masters` has a witness of its expert's own. *Polished*: the "
             "default's witnesses after this many env steps of `search.polish` each, the shortest whatever its "
             "portability.",
         ],

@@ -30,6 +30,7 @@ from levelproof.levelgen.files.level_file import LevelFile, write_level_file
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
+from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.runtime import prepare_jax
 
 BUDGET = 64_000  # env steps of an expert
@@ -157,6 +158,8 @@ def register(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Report:
     prepare_jax()
+    if len(args.levels) not in (1, len(args.size)):
+        raise UserError("--levels: give one number for all sizes, or one for each.")
     python = oracle.oracle_python()
     counts = np.broadcast_to(args.levels, len(args.size)).tolist()
     results = [

@@ -1,4 +1,4 @@
-"""What a policy for all levels could give back to the search: attempts at levels before anything searches them.
+"""What a policy for all levels could save the search: attempts at levels before anything searches them.
 
 The splits are those of the default procedure, so their manifests say what was found without the policy, and at what
 cost. Attempts that reach the goal would save at most the whole search of their levels.
@@ -93,8 +93,9 @@ def run(args: argparse.Namespace) -> Report:
         [
             f"The splits: {commands}. Their labels are those of a procedure that knows no policy. "
             "Levels that are trivial or proved unsolvable are left out.",
-            "The attempts are made at all levels that would be searched, and timed without compiling. They would save "
-            "at most the seconds in the third column.",
+            "The attempts are made at all levels that would be searched. They would save at most *search of levels "
+            "that the attempts solve*. They are timed in CPU seconds, without compiling; the other columns are seconds "
+            "of a clock, from the manifest, which other work on the machine makes longer.",
             "The policy's steps are those of its shortest attempt that reaches the goal, on levels that both solve.",
         ],
     )

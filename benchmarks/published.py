@@ -25,16 +25,16 @@ def main(sizes: list[str]) -> int:
     return 0
 
 
-def write(size: str, count: int = RANDOM_LEVELS) -> None:
+def write(size: str) -> None:
     """Have the reference sample the levels of a size, unless they are there."""
     path = random_file(size)
     path.parent.mkdir(exist_ok=True)
     with alone(path.with_suffix(".lock")):
         if path.exists():
             return
-        log(f"Sampling {count} levels of size {size} with the reference ...")
+        log(f"Sampling {RANDOM_LEVELS} levels of size {size} with the reference ...")
         unfinished = path.with_name(f"unfinished-{path.name}")
-        arguments = [unfinished, "--size", size, "--count", count]
+        arguments = [unfinished, "--size", size, "--count", RANDOM_LEVELS]
         oracle.run_script(oracle.oracle_python(), "published", arguments, "sample the reference's random levels")
         unfinished.replace(path)
 

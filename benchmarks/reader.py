@@ -38,6 +38,8 @@ def register(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> Report:
     python = oracle.oracle_python()
     results = [measured(python, size, args.seconds) for size in args.size]
+    copied = {each["size"]: each["ours"]["full"]["copied"] / each["reference"]["copied"] for each in results}
+    missed = [size for size, times in copied.items() if times < TARGETS[size]]
     return Report(
         title="Reading trajectories",
         results=results,
@@ -46,7 +48,8 @@ def run(args: argparse.Namespace) -> Report:
             f"Random batches of {BATCH} whole trajectories with every field, after {WARM} to warm up; the reference "
             "draws runs of neighbours, our reader draws trajectories one by one. Both return arrays (batch, time, ...) "
             "that are views of what they decoded; the second table includes a copy of every array.",
-            f"Targets are {', '.join(f'{times}x for {size}' for size, times in TARGETS.items())}.",
+            f"Targets for *full* in the second table: {', '.join(f'{n}x for {size}' for size, n in TARGETS.items())}. "
+            f"{'Missed by ' + ', '.join(missed) if missed else 'All are met'}.",
         ],
         reference=oracle.versions(python),
     )

@@ -266,7 +266,7 @@ def run(args: argparse.Namespace) -> Report:
             f"{HEARING * 1e3:.0f} ms for Ray's part of a report, which is assumed. *writes/s*: requests to an object "
             f"store, {REQUESTS} per unit; S3 promises {PUTS:,} a second per prefix. *first*: the most loaded of store, "
             "driver and workers, and its load; above 100% it cannot keep up, and the job takes longer than shown.",
-            f"The plan and the scheduler take {peak / 2**20:.0f} MB of the driver's memory with all workers busy.",
+            f"The plan and the scheduler take {peak / 2**20:.0f} MiB of the driver's memory with all workers busy.",
         ],
     )
 

@@ -27,7 +27,8 @@ def run(args: argparse.Namespace) -> Report:
         ours = json.loads(oracle.run_ours("sampler", arguments))
         theirs = json.loads(oracle.run_script(python, "sampler", arguments, "sample levels with the reference"))
         results.append(result(size, ours, theirs))
-    head = ("size", "first call, s", "of it LLVM and XLA", "reference", "levels/s", "reference", "ratio")
+    first = "first call, s", "of that, LLVM and XLA", "reference's first call, s"
+    head = ("size", *first, "levels/s", "reference's levels/s", "ratio")
     return Report(
         title="Samplers",
         results=results,

@@ -19,6 +19,7 @@ from jaxtyping import Int
 from scipy.stats import chi2
 
 from benchmarks.oracle import log
+from benchmarks.plotting import pyplot
 from benchmarks.report import Report, Table
 from benchmarks.statistics import wilson
 from levelproof.configs.numbers import parse_count
@@ -33,6 +34,7 @@ from levelproof.levelgen.batching import blocks, take
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
+from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.runtime import cache_folder, own_cores, prepare_jax
 
 FIRST = 1_000_000  # first level id; nothing was tuned on this level or later ones
@@ -59,6 +61,8 @@ def register(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> Report:
     prepare_jax(min(own_cores()))
+    if len(args.env_steps) not in (1, len(args.size)):
+        raise UserError("--env-steps: give one number for all sizes, or one for each.")
     budgets = np.broadcast_to([parse_count(x, "--env-steps") for x in args.env_steps], len(args.size)).tolist()
     max_steps = dict(zip(args.size, budgets, strict=True))
     folder = cache_folder() / "search"
@@ -235,8 +239,7 @@ def row(size: str, steps: Int[np.ndarray, " level"], env_steps: int) -> Sequence
 
 def draw(path: Path, steps_by_size: Mapping[str, Int[np.ndarray, " level"]], max_steps: Mapping[str, int]) -> None:
     """Plot the curves with their intervals."""
-    import matplotlib.pyplot as plt
-
+    plt = pyplot()
     figure, axes = plt.subplots(figsize=(6, 3.5), layout="constrained")
     for size, steps in steps_by_size.items():
         budgets = doublings(max_steps[size])
@@ -247,5 +250,5 @@ def draw(path: Path, steps_by_size: Mapping[str, Int[np.ndarray, " level"]], max
     axes.set(xscale="log", ylim=(0, None), xlabel="env steps of search, a level", ylabel="unsolved, %")
     axes.legend(title="size", frameon=False)
     axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path)
+    figure.savefig(path, metadata={"Date": None})
     plt.close(figure)

@@ -70,8 +70,8 @@ def run(args: argparse.Namespace) -> Report:
             "observation. *Lanes* plays random actions with observations, and reads nothing.",
             f"Bytes per trajectory: those of *{RELEASED}* are {RECORD_STEPS} times the bytes of a transition in its 1M "
             f"split of this size; those of `full`, `resume` and `witness` {RECORD_STEPS} times what storage.md "
-            f"measured in a split of the default procedure; those of `seed` are of the first {TRAJECTORIES:,} "
-            "trajectories here, trivial ones included. All but `seed` keep whole records.",
+            "measured on witnesses of experts alone, which are longer than those of a search; those of `seed` are of "
+            f"the first {TRAJECTORIES:,} trajectories here, trivial ones included. All but `seed` keep whole records.",
             f"![Bytes per trajectory of {found[0]['size']} on a logarithmic axis: released data, and our densities]"
             f"({PLOT})",
         ],

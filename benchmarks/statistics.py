@@ -1,6 +1,7 @@
 """Confidence intervals and tests for benchmarks, from scipy and statsmodels."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest
@@ -22,6 +23,16 @@ def mcnemar(only_one: int, only_other: int) -> float:
     """
     flips = only_one + only_other
     return float(binomtest(only_one, flips).pvalue) if flips else 1.0
+
+
+def flips(pairs: Iterable[tuple[Any, Any]], solved: Any, unsolved: Any) -> list[str]:
+    """Compare two labels of each level; return cells of a table.
+
+    They are the levels that both call solved or unsolved, those that only the first and only the second solves, and p.
+    """
+    undecided = [pair for pair in pairs if {*pair} <= {solved, unsolved}]
+    lost, gained = undecided.count((solved, unsolved)), undecided.count((unsolved, solved))
+    return [f"{len(undecided):,}", str(lost), str(gained), f"{mcnemar(lost, gained):.2g}"]
 
 
 def holm(p: Sequence[float]) -> list[float]:

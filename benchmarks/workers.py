@@ -23,7 +23,7 @@ from rich.console import Console
 
 from benchmarks.report import Report, Table
 from levelproof.configs.compose import compose_job
-from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs.progress import Board, Tally
 from levelproof.pipeline.jobs.schedule import ROUND, STRETCH, Order, Round, Scheduler, UnitOutcome, WorkUnit, plan_units
 from levelproof.pipeline.runtime import own_cores, prepare_jax
@@ -57,6 +57,8 @@ def register(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> Report:
+    if len(own_cores()) < 2:
+        raise UserError("Two workers need two cores: run this on a machine that has them.")
     simulated = [simulate(units) for units in UNITS]
     settings = [f"size={args.size}", f"budget={args.budget}", f"levels={args.levels}", "first_level=1000000"]
     pairs = [tuple(args.levels / seconds_of(settings, workers) for workers in (1, 2)) for _ in range(args.repeats)]

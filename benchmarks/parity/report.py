@@ -105,9 +105,9 @@ def episodes(played: Mapping[str, Episodes]) -> Table:
     share = lambda value: "-" if value is None else f"{value:.1%}"
     rows = []
     for size, result in played.items():
-        shares = (result.same, result.same_touched, result.target, result.reference_itself, result.ours_itself)
+        shares = (result.same, result.target, result.same_touched, result.reference_itself, result.ours_itself)
         rows.append([size, f"{result.pairs:,}", str(result.touched), *map(share, shares)])
-    shares = ("same outcome", "of those that touch", "target", "reference and itself", "ours and itself")
+    shares = ("same outcome", "target", "of those that touch", "reference and itself", "ours and itself")
     title = "Whole episodes; an engine and itself: from starts one unit in the last place away"
     return Table(("size", "episodes", "end by touching", *shares), rows, title)
 

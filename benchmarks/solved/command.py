@@ -26,6 +26,7 @@ PLOTTED = (
     "l-4M-alone",
 )  # groups whose curves are plotted by default
 PLOT = "solved.svg"
+LARGER = "; the samples in the first two tables: 2026-11-25 to 28, sampler 2"
 
 
 def register(parser: argparse.ArgumentParser) -> None:
@@ -100,16 +101,16 @@ def report_of(results: list[Results], whole: bool) -> Report:
         notes=[
             *([f"![How the unsolved share falls with budget]({PLOT})"] if curves else []),
             tables.variants_of(results),
-            "*Undecided* levels are neither trivial nor proved unsolvable. Tables after the first compare variants on "
-            f"the same levels: those of `default` with fewer than {tables.ENOUGH:,} undecided ones, marked *few*, are "
-            "not to be quoted for the solved share itself. Their levels are of sampler 1, whose numbers differ from "
-            "today's in the last bits.",
+            "*Undecided* levels are neither trivial nor proved unsolvable. Tables with a column *variant* compare "
+            f"variants on the same levels: rows of `default` with fewer than {tables.ENOUGH:,} undecided levels, "
+            "marked *few*, are not to be quoted for the solved share itself. Levels of these tables are of sampler 1, "
+            "whose numbers differ from today's in the last bits.",
             "*An expert reaches the goal by itself* if its witness is its own, or if attempts of its last evaluation "
             "reach it; a search's witness replaces an expert's that survives fewer than half of its replays. Success "
             "rates are of first episodes; - means not measured.",
         ],
         plots={PLOT: lambda path: plot.draw(curves, path)} if curves else {},
-        made=made(results),
+        made=made(results) + LARGER * whole,
     )
 
 
