@@ -6,7 +6,8 @@ for settings in "$then out=before" out=after; do
   levelproof generate size=m levels=1200 first_level=1100000 budget=256k $settings
   levelproof generate size=l levels=1120 first_level=1100000 budget=256k $settings
 done
-python benchmarks/results/make_report.py before after
+levelproof generate size=l levels=1120 first_level=1100000 budget=256k procedure=thorough out=thorough
+python benchmarks/results/make_report.py before after thorough
 """
 
 import json
