@@ -25,6 +25,7 @@ from benchmarks.plotting import pyplot
 from benchmarks.report import RESULTS, Report, Table
 from benchmarks.storage import PUBLISHED
 from levelproof.experts.config import RECORD_STEPS
+from levelproof.levelgen.level import SIZES
 from levelproof.pipeline.dataset.dataset import EPISODES_AT_ONCE
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.runtime import own_cores, prepare_jax
@@ -33,10 +34,16 @@ from levelproof.pipeline.store.seed.file import seed_files
 BATCH = 64
 TRAJECTORIES = 2048  # of the seeds that are read, the first ones
 MANIFESTS = Path(__file__).parent.parent / "manifests"
-SEEDS = [MANIFESTS / "16k" / "s", MANIFESTS / "16k" / "m", MANIFESTS / "256k" / "l"]
+SEEDS = [MANIFESTS / "256k" / size for size in SIZES]
 OBSERVATION = "symbolic_flat"
 RELEASED, PLOT = "released data", "seeds.svg"
-PUBLISHED_LEVELS, PUBLISHED_BYTES = 11_500_000, 326e9  # solved levels of Kinetix-Offline, and its size
+PUBLISHED_SPLITS = (  # of Kinetix-Offline, by its card: budget, size, solved levels, bytes
+    ("1M", "s", 5_980_000, 123e9),
+    ("1M", "m", 3_450_000, 98e9),
+    ("1M", "l", 1_050_000, 82e9),
+    ("10M", "s", 637_000, 12e9),
+    ("10M", "m", 422_000, 11e9),
+)
 
 
 def register(parser: argparse.ArgumentParser) -> None:
@@ -60,9 +67,10 @@ def run(args: argparse.Namespace) -> Report:
     return Report(
         title="Seeds",
         results=found,
-        tables=[files_of(found), columns_of(found), densities_of(found), rates_of(found)],
+        tables=[files_of(found), extrapolation(found), columns_of(found), densities_of(found), rates_of(found)],
         notes=[
-            extrapolation(found[0]),
+            "Bytes per solved level are those of all files, so levels that are not solved are included. Seeds keep "
+            "first episodes; the rest of a released record of 256 steps is further episodes of the same expert.",
             f"The first {TRAJECTORIES:,} trajectories of each folder, from the page cache, with programs compiled "
             "before. *Seeds* are simulated, *full* shards decoded. *First episodes* come from "
             "`Dataset.episode_batches`; *records* from `Dataset.read`, whole ones of 256 steps, of which the first "
@@ -124,15 +132,20 @@ def rates_of(found: Sequence[dict[str, Any]]) -> Table:
     return Table(("size", "read from", "transitions/s", "trajectories/s", "against Lanes"), rows, title)
 
 
-def extrapolation(one: Mapping[str, Any]) -> str:
-    """Say what a dataset as large as the released one would take."""
-    per_level = one["bytes"] / one["solved"]
-    return (
-        f"At {per_level:.1f} bytes per solved level, {PUBLISHED_LEVELS:,} solved levels of {one['size']} would take "
-        f"{PUBLISHED_LEVELS * per_level / 1e6:,.0f} MB, where the {PUBLISHED_LEVELS:,} of the released dataset, of "
-        f"three sizes, take {PUBLISHED_BYTES / 1e9:,.0f} GB. Seeds keep first episodes; what follows in a released "
-        "record of 256 steps are further episodes of the same expert, which seeds do not have."
-    )
+def extrapolation(found: Sequence[Mapping[str, Any]]) -> Table:
+    """Tabulate what the released dataset's splits would take at each size's bytes per solved level."""
+    per_level = {one["size"]: one["bytes"] / one["solved"] for one in found}
+    splits = [split for split in PUBLISHED_SPLITS if split[1] in per_level]
+    rows = [
+        [budget, size, f"{levels:,}", f"{bytes_ / 1e9:,.0f}", f"{per_level[size]:.1f}",
+         f"{levels * per_level[size] / 1e6:,.0f}"]
+        for budget, size, levels, bytes_ in splits
+    ]  # fmt: skip
+    levels, bytes_ = sum(split[2] for split in splits), sum(split[3] for split in splits)
+    seeds = sum(levels * per_level[size] for _, size, levels, _ in splits)
+    rows.append(["all", "", f"{levels:,}", f"{bytes_ / 1e9:,.0f}", f"{seeds / levels:.1f}", f"{seeds / 1e6:,.0f}"])
+    head = ("budget", "size", "solved levels", "released, GB", "bytes per solved level here", "as seeds, MB")
+    return Table(head, rows, "Splits of the released dataset, and what seeds of as many solved levels would take")
 
 
 def stored(seeds: Path) -> dict[str, Any]:
