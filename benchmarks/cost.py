@@ -35,6 +35,13 @@ JOBS = (
     f"size=l budget=256k levels=500 {REPORT_LEVELS}",
 )
 SMALL = "levels=64"  # overrides a job's levels, to compile
+ON_ONE_CORE = f"""
+import os, sys
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, [{own_cores()[0]}])
+from levelproof.__main__ import main
+sys.exit(main())
+"""
 SETTLED = 6.0  # s until programs of sources that were just written are kept in the cache folder
 
 
@@ -108,19 +115,19 @@ def generated(sources: Path, settings: Sequence[str]) -> dict[str, Any]:
         Failure: the command fails.
     """
     with tempfile.TemporaryDirectory() as out:
-        command = [sys.executable, "-m", "levelproof", "generate", *settings, "executor=inline", f"out={out}"]
+        command = [sys.executable, "-c", ON_ONE_CORE, "generate", *settings, "executor=inline", f"out={out}"]
         environment = os.environ | {
             "PYTHONPATH": str(sources),
             CACHE_VARIABLE: str(cache_folder() / "cost" / sources.name),
         }
         environment.pop("PYTHONDONTWRITEBYTECODE", None)  # Python would compile all sources in every run
-        alone = lambda: os.sched_setaffinity(0, own_cores()[:1])
         before = _cpu_seconds()
-        # `-m` looks in the working directory before PYTHONPATH
-        done = subprocess.run(command, cwd=sources, env=environment, preexec_fn=alone, capture_output=True, text=True)
+        # Python looks for modules in the working directory first
+        done = subprocess.run(command, cwd=sources, env=environment, capture_output=True, text=True)
         seconds = _cpu_seconds() - before
         if done.returncode:
-            raise Failure(f"`{' '.join(command)}` in {sources} fails with {done.returncode}:\n{done.stderr[-2000:]}")
+            words = " ".join(command[3:])
+            raise Failure(f"`levelproof {words}` in {sources} fails with {done.returncode}:\n{done.stderr[-2000:]}")
         manifests = [str(path) for path in Path(out).glob("*/*/manifest")]
         rows = [ds.dataset(path, format="parquet").to_table(["level_id", "label"]).to_pylist() for path in manifests]
     return {"seconds": seconds, "labels": {row["level_id"]: row["label"] for each in rows for row in each}}
