@@ -1,4 +1,6 @@
-"""Advantages equal a plain loop, and PPO learns a bandit."""
+"""Advantages and the terms of the objective equal plain formulas, and PPO learns a bandit."""
+
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +8,8 @@ import numpy as np
 import pytest
 
 from levelproof.experts.config import ExpertConfig, Network
-from levelproof.experts.objective import advantages
+from levelproof.experts.networks.flat import resting_features
+from levelproof.experts.objective import advantages, terms
 from levelproof.experts.policy import forward, log_probability, network_of, sample
 from levelproof.experts.training import ppo
 from levelproof.experts.training.ppo import LevelConstants, Samples
@@ -29,6 +32,64 @@ def test_advantages_equal_the_plain_formula() -> None:
         running = reward[t] + 0.9 * following * alive - value[t] + 0.9 * 0.8 * alive * running
         expected[t], following = running, value[t]
     np.testing.assert_allclose(advantages(value, reward, done, last, config), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_terms_equal_the_plain_formulas() -> None:
+    """Some samples are on either side of the clipped ratio and of the clipped value, some within."""
+    rng, count, clip = np.random.default_rng(2), 40, 0.2
+    logits = rng.normal(size=(sum(CHOICES), count)).astype(np.float32)
+    action = np.stack([rng.integers(0, choices, count) for choices in CHOICES])
+    live = np.array([True, True, False, True, False, True])[:, None]
+    gain, value, value_before, advantage = rng.normal(size=(4, count)).astype(np.float32)
+
+    entries = np.split(logits, np.cumsum(CHOICES)[:-1])
+    probability = [np.exp(entry) / np.exp(entry).sum(0) for entry in entries]
+    of_action = np.array([entry[chosen, range(count)] for entry, chosen in zip(probability, action, strict=True)])
+    nats = np.array([-(entry * np.log(entry)).sum(0) for entry in probability])
+    log_now = (np.log(of_action) * live).sum(0)
+    ratio = rng.uniform(0.5, 1.5, count).astype(np.float32)
+    surrogate, error = np.zeros(count), np.zeros(count)
+    for i in range(count):
+        bound = min(max(ratio[i], 1 - clip), 1 + clip)
+        surrogate[i] = min(ratio[i] * gain[i], bound * gain[i])
+        target = value_before[i] + advantage[i]
+        near = value_before[i] + min(max(value[i] - value_before[i], -clip), clip)
+        error[i] = max((value[i] - target) ** 2, (near - target) ** 2) / 2
+    for sign in (-1, 1):
+        assert (surrogate != ratio * gain)[np.sign(gain) == sign].any()
+        assert (surrogate == ratio * gain)[np.sign(gain) == sign].any()
+    worse = error > (value - value_before - advantage) ** 2 / 2 + 1e-3
+    assert 0 < worse.sum() < count
+
+    got = jax.jit(terms)(logits, value, action, live, log_now - np.log(ratio), value_before, advantage, gain, clip)
+    np.testing.assert_allclose(got.surrogate, surrogate.mean(), rtol=1e-4)
+    np.testing.assert_allclose(got.value_error, error.mean(), rtol=1e-4)
+    np.testing.assert_allclose(got.entropy, (nats * live).sum(0).mean(), rtol=1e-4)
+    np.testing.assert_allclose(got.log_probability, log_now, rtol=1e-4)
+
+
+def test_loss_rewards_entropy_and_the_rehearsed_actions() -> None:
+    """At uniform logits: it falls by a bonus times their entropy, and rises where rehearsed actions are unlikely."""
+    config = ExpertConfig(network=Network.FLAT, width=16, entropy_weight=0.0, imitation_weight=0.0)
+    network, count = network_of(SIZE, config), 8
+    constants = LevelConstants(jnp.zeros(len(resting_features(SIZE))), jnp.ones(len(CHOICES), bool))
+    begun = jax.eval_shape(lambda: ppo.init(jax.random.key(0), network, constants.features, config))
+    params = jax.tree.map(lambda x: jnp.zeros(x.shape), begun.params)
+    nats, zeros = np.log(CHOICES).sum(), jnp.zeros(count)
+    rehearsed = jnp.arange(count) < 2
+    minibatch = Samples(
+        jnp.ones((DYNAMIC, count)), jnp.zeros((len(CHOICES), count)), zeros - nats, zeros, zeros, rehearsed * 1.0
+    )
+
+    @jax.jit
+    def losses():
+        some = config, replace(config, entropy_weight=0.5), replace(config, imitation_weight=0.5)
+        return [ppo.loss(params, network, constants, minibatch, each) for each in some]
+
+    plain, with_bonus, imitating = losses()
+    np.testing.assert_allclose(plain, 0.0, atol=1e-6)
+    np.testing.assert_allclose(with_bonus, -0.5 * nats, rtol=1e-4)
+    np.testing.assert_allclose(imitating, 0.5 * nats * 2 / count, rtol=1e-4)
 
 
 def test_rows_round_trip_samples() -> None:
