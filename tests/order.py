@@ -23,6 +23,7 @@ TOGETHER = {
         "tests/experts/test_evaluation",
         "tests/experts/test_policy",
         "tests/experts/training/test_ppo",
+        "tests/experts/training/test_rollout",
     ),
     "jobs": ("tests/pipeline/jobs", "tests/pipeline/cli", "tests/test_manifests", "tests/benchmarks/test_handmade"),
     "experts": ("tests/experts",),

@@ -24,6 +24,7 @@ BRIEF = (
     "tests/experts/test_evaluation",
     "tests/experts/test_policy",
     "tests/experts/training/test_ppo",
+    "tests/experts/training/test_rollout",
     "tests/experts/verdict/test_portability",
     "tests/levelgen/task/",
     "tests/levelgen/test_mutate",

@@ -173,8 +173,8 @@ def test_continued_expert_equals_one_trained_without_a_break(levels: Level, stop
         same(level, through[i])
 
 
-def test_expert_rehearses_an_earlier_success_from_the_first_update(levels: Level, whole: list[TrainedLevel]) -> None:
-    """The first episode repeats it to the goal; rehearsing lanes do not count as the expert's own."""
+def test_expert_keeps_an_earlier_success(levels: Level, whole: list[TrainedLevel]) -> None:
+    """Training replaces it by none of its own; levels without one train as if nobody had searched."""
     findings = nothing_found(len(IDS))._replace(success=random_successes(levels, IDS))
     trained, _ = train(levels, IDS, 2, CONFIG, WHOLE, found=findings)
     assert 0 < (findings.success.length > 0).sum() < len(IDS)
