@@ -2,7 +2,6 @@
 
 import errno
 import itertools
-import json
 import shutil
 from collections.abc import Callable
 from datetime import timedelta
@@ -21,8 +20,8 @@ from levelproof.pipeline.errors import StoreFailure
 from levelproof.pipeline.jobs import repair as repairing
 from levelproof.pipeline.store import fragment, remote
 from levelproof.pipeline.store import shard as shards
-from levelproof.pipeline.store.checksums import digests_of, with_own
-from levelproof.pipeline.store.formats import DIGESTS_KEY, VERSION_KEY
+from levelproof.pipeline.store.checksums import with_own
+from levelproof.pipeline.store.formats import VERSION_KEY
 from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.layout import JOB, MANIFEST, unit_name
 from levelproof.pipeline.store.locks import only_writer
@@ -35,42 +34,7 @@ from levelproof.pipeline.verify.verify import examine
 from tests.pipeline.command import assert_refused, here
 from tests.pipeline.made import honest_split, made_job
 from tests.pipeline.servers import files_of, serving
-
-UNIT, UNITS = 8, 6
-
-Row = dict[str, Any]
-
-
-@pytest.fixture(scope="module")
-def honest(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = honest_split(tmp_path_factory.mktemp("data"), UNIT, UNITS)
-    assert set(read_manifest(path, ["label"]).labels) == set(Label)
-    return path
-
-
-@pytest.fixture
-def split(honest: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(honest, tmp_path / "s"))
-
-
-def forge(split: Path, change: Callable[[Row], None] = lambda row: None, level_ids: list[int] | None = None) -> None:
-    """Change rows, and rewrite their fragments with valid checksums."""
-    for path in fragment_paths(split):
-        table = pq.read_table(path)
-        rows = table.to_pylist()
-        for row in rows:
-            if level_ids is None or row["level_id"] in level_ids:
-                change(row)
-        names = {row["shard"] for row in rows if row["shard"] and (split / row["shard"]).exists()}
-        digests = {DIGESTS_KEY: json.dumps({name: digests_of(split / name) for name in names})}
-        whole = pa.BufferOutputStream()
-        forged = pa.Table.from_pylist(rows, schema=table.schema.with_metadata(table.schema.metadata | digests))
-        pq.write_table(forged, whole, write_page_checksum=True)
-        path.write_bytes(with_own(whole.getvalue().to_pybytes()))
-
-
-def rows_labelled(split: Path, *labels: Label) -> list[Row]:
-    return [row for row in read_manifest(split).table.to_pylist() if row["label"] in labels]
+from tests.pipeline.verify.forged import UNIT, UNITS, Row, assert_reported, forge, rows_labelled
 
 
 def neighbours(split: Path) -> tuple[Row, Row]:
@@ -103,13 +67,6 @@ def raising(error: Exception) -> Callable[..., Any]:
         raise error
 
     return fail
-
-
-def assert_reported(split: Path, *sentences: str) -> None:
-    wrong = examine(split).sentences
-    assert len(wrong) == len(sentences), wrong
-    for sentence, reported in zip(sentences, sorted(wrong), strict=True):
-        assert sentence in reported
 
 
 def test_examine_finds_nothing_wrong_in_an_honest_split(honest: Path, monkeypatch: pytest.MonkeyPatch) -> None:
