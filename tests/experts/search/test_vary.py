@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from levelproof.experts.search.archive import Archive, ReachedStates
 from levelproof.experts.search.config import NEAREST, SearchConfig
 from levelproof.experts.search.edit import Draws, draw, edited
 from levelproof.experts.search.explore import NEARER
@@ -22,6 +24,7 @@ from levelproof.experts.search.vary import (
     change_of,
     changed,
     first_of,
+    nearest_of,
     under_way,
     vary,
 )
@@ -209,6 +212,20 @@ def test_variation_has_at_least_one_change() -> None:
     assert (np.asarray(one)[:60] == 5).all()
     assert (np.asarray(one)[60:] == 0).all()
     assert (np.asarray(both)[60:100] == 5).all()
+
+
+def test_nearest_of_takes_the_trajectories_to_the_nearest_entries() -> None:
+    """Not those to unused entries or broken states; each repeats its last action, the start its first."""
+    count = NEAREST + 1
+    steps, distance, nothing = np.zeros((1, count), int), np.full((1, count), FAR, np.float32), np.zeros((1, count))
+    steps[0, :4], distance[0, :4] = [3, 5, 2, 0], [0.4, 0.1, np.nan, 0.2]
+    code = np.arange(count * 6).reshape(1, count, 6).astype(np.uint16)
+    entry: Any = nothing, nothing, code, steps, distance
+    rest: Any = np.arange(count)[None] != 1, nothing, nothing, nothing[:, 0], nothing[:, 0]
+    kept = nearest_of(Archive(ReachedStates(*entry), *rest))
+    np.testing.assert_array_equal(kept.gap[0], np.array([0.2, 0.4, *[FAR] * (NEAREST - 2)], np.float32))
+    np.testing.assert_array_equal(kept.steps[0, :2], [0, 3])
+    np.testing.assert_array_equal(kept.code[0, :2], [[18] * 6, [0, 1, 2, 2, 2, 2]])
 
 
 def test_first_of_keeps_the_nearest_trajectories() -> None:
