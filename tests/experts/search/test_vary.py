@@ -216,7 +216,7 @@ def test_variation_has_at_least_one_change() -> None:
 
 def test_nearest_of_takes_the_trajectories_to_the_nearest_entries() -> None:
     """Not those to unused entries or broken states; each repeats its last action, the start its first."""
-    count = NEAREST + 1
+    count = NEAREST
     steps, distance, nothing = np.zeros((1, count), int), np.full((1, count), FAR, np.float32), np.zeros((1, count))
     steps[0, :4], distance[0, :4] = [3, 5, 2, 0], [0.4, 0.1, np.nan, 0.2]
     code = np.arange(count * 6).reshape(1, count, 6).astype(np.uint16)
