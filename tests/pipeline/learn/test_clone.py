@@ -1,8 +1,7 @@
 """Cloning of a policy from a small real split."""
 
-import json
 import shutil
-from dataclasses import is_dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +13,6 @@ from PIL import Image
 
 import levelproof
 from levelproof.configs.clone import CloneConfig
-from levelproof.configs.compose import override_of
-from levelproof.configs.convert import plain
-from levelproof.configs.meanings import comments_in
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.evaluation import play, play_sampled
 from levelproof.experts.imitation import ImitationConfig, from_motion
@@ -34,7 +30,8 @@ from levelproof.pipeline.learn.pool import Feed, read_pool
 from levelproof.pipeline.learn.sealed import SEALED
 from levelproof.pipeline.runtime import CACHE_VARIABLE
 from levelproof.pipeline.store.locks import only_clone
-from tests.pipeline.command import ROOT, assert_refused, here
+from tests.pipeline.command import assert_refused, here
+from tests.pipeline.learn.runs import assert_guide_lists, metrics
 from tests.pipeline.made import played_split
 from tests.quick import jit_once
 
@@ -55,10 +52,6 @@ def cloned(folder: Path, split: Path, *words: str) -> Path:
     done = here(["clone", str(split), "-o", str(out), *SETTINGS, *words], folder)
     assert done.returncode == 0, done.stderr
     return out
-
-
-def metrics(out: Path) -> list[dict[str, float]]:
-    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
 
 
 @pytest.fixture(scope="module")
@@ -284,9 +277,4 @@ def test_copies_of_sealed_levels_are_left_out(tmp_path: Path, monkeypatch: pytes
 
 
 def test_guide_lists_every_setting_with_its_default_and_meaning() -> None:
-    guide = (ROOT / "docs/train.md").read_text()
-    for path, cls in ("", CloneConfig), ("network.", NetworkConfig), ("train.", ImitationConfig):
-        for name, comment in comments_in(cls).items():
-            value = getattr(cls(), name)
-            if not is_dataclass(value):
-                assert f"| `{override_of(path + name, plain(value))}` | {comment.beside} |" in guide
+    assert_guide_lists({"": CloneConfig(), "network.": NetworkConfig(), "train.": ImitationConfig()}, "train")

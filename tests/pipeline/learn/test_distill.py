@@ -1,8 +1,6 @@
 """Distilling a policy from teachers on a small real split, and continuing to the same bytes."""
 
-import json
 import shutil
-from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +10,8 @@ import pytest
 from safetensors.numpy import load_file
 
 import levelproof
-from levelproof.configs.compose import compose_distill, override_of
-from levelproof.configs.convert import plain
+from levelproof.configs.compose import compose_distill
 from levelproof.configs.distill import DistillConfig
-from levelproof.configs.meanings import comments_in
 from levelproof.experts.generalist.teachers import Labels
 from levelproof.experts.labels import Label
 from levelproof.experts.networks.over_levels import NetworkConfig
@@ -26,7 +22,8 @@ from levelproof.pipeline.learn.kept_experts import experts_of
 from levelproof.pipeline.learn.labelled import empty_labels, with_labels
 from levelproof.pipeline.store.checkpoints import begun_like, save_experts
 from levelproof.pipeline.store.layout import EXPERTS
-from tests.pipeline.command import ROOT, assert_refused, here
+from tests.pipeline.command import assert_refused, here
+from tests.pipeline.learn.runs import assert_guide_lists, metrics
 from tests.pipeline.made import made_job
 
 TINY = ("network.width=8", "network.depth=1", "network.heads=1")
@@ -40,10 +37,6 @@ def distilled(folder: Path, split: Path, *words: str) -> Path:
     done = here(["distill", str(split), "-o", "policy", *ROUNDS, *TEACHERS, *words], folder)
     assert done.returncode == 0, done.stderr
     return folder / "policy"
-
-
-def metrics(out: Path) -> list[dict[str, float]]:
-    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
 
 
 @pytest.fixture(scope="module")
@@ -250,9 +243,5 @@ def test_a_changed_setting_keeps_the_other_defaults_of_its_group() -> None:
 
 
 def test_guide_lists_every_setting_with_its_default_and_meaning() -> None:
-    guide, config = (ROOT / "docs/distill.md").read_text(), DistillConfig()
-    for path, group in {"": config, "teachers.": config.teachers, "train.": config.train}.items():
-        for name, comment in comments_in(type(group)).items():
-            value = getattr(group, name)
-            if not is_dataclass(value):
-                assert f"| `{override_of(path + name, plain(value))}` | {comment.beside} |" in guide
+    config = DistillConfig()
+    assert_guide_lists({"": config, "teachers.": config.teachers, "train.": config.train}, "distill")

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +10,6 @@ import pytest
 from safetensors.numpy import load_file
 
 import levelproof
-from levelproof.configs.compose import override_of
-from levelproof.configs.convert import plain
-from levelproof.configs.meanings import comments_in
 from levelproof.configs.train import TrainConfig
 from levelproof.experts.generalist.config import CurriculumConfig, EvolveConfig, PPOConfig, ReplayConfig
 from levelproof.experts.generalist.train import _programs as programs
@@ -25,7 +21,8 @@ from levelproof.pipeline.learn import train as module
 from levelproof.pipeline.learn.folder import weights_digest
 from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.trained_on import levels_for
-from tests.pipeline.command import ROOT, assert_refused, here
+from tests.pipeline.command import assert_refused, here
+from tests.pipeline.learn.runs import assert_guide_lists, metrics
 
 LANES = (
     "ppo.environments=64",
@@ -46,10 +43,6 @@ def trained(folder: Path, updates: int, *words: str) -> Path:
     done = here(["train", "-o", "agent", steps, *LANES, *words], folder)
     assert done.returncode == 0, done.stderr
     return folder / "agent"
-
-
-def metrics(out: Path) -> list[dict[str, float]]:
-    return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
 
 
 @pytest.fixture(scope="module")
@@ -310,10 +303,5 @@ def test_training_starts_from_linked_weights(agent: Path, tmp_path: Path) -> Non
 
 
 def test_guides_list_every_setting_with_its_default_and_meaning() -> None:
-    guide = "".join((ROOT / f"docs/{page}.md").read_text() for page in ("finetune", "curricula"))
-    groups = {"": TrainConfig, "ppo.": PPOConfig, "curriculum.": CurriculumConfig}
-    for path, cls in (groups | {"replay.": ReplayConfig, "evolve.": EvolveConfig}).items():
-        for name, comment in comments_in(cls).items():
-            value = getattr(cls(), name)
-            if not is_dataclass(value):
-                assert f"| `{override_of(path + name, plain(value))}` | {comment.beside} |" in guide
+    groups = {"": TrainConfig(), "ppo.": PPOConfig(), "curriculum.": CurriculumConfig()}
+    assert_guide_lists(groups | {"replay.": ReplayConfig(), "evolve.": EvolveConfig()}, "finetune", "curricula")
