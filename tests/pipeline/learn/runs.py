@@ -6,14 +6,26 @@ from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from safetensors.numpy import load_file
+
 from levelproof.configs.compose import override_of
 from levelproof.configs.convert import plain
 from levelproof.configs.meanings import comments_in
+from levelproof.experts.networks.saved import WEIGHTS
 from tests.pipeline.command import ROOT
 
 
 def metrics(out: Path) -> list[dict[str, float]]:
     return [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+
+
+def assert_average_is_kept(out: Path, average: str, last: str) -> None:
+    """Check that a folder's policy has the average of the weights, not the last ones; by prefixes in the checkpoint."""
+    kept, weights = load_file(out / "checkpoint.safetensors"), load_file(out / WEIGHTS)
+    for name, values in weights.items():
+        np.testing.assert_array_equal(values, kept[average + name])
+    assert any((values != kept[last + name]).any() for name, values in weights.items())
 
 
 def assert_guide_lists(settings: Mapping[str, Any], *pages: str) -> None:

@@ -23,7 +23,7 @@ from levelproof.pipeline.learn.labelled import empty_labels, with_labels
 from levelproof.pipeline.store.checkpoints import begun_like, save_experts
 from levelproof.pipeline.store.layout import EXPERTS
 from tests.pipeline.command import assert_refused, here
-from tests.pipeline.learn.runs import assert_guide_lists, metrics
+from tests.pipeline.learn.runs import assert_average_is_kept, assert_guide_lists, metrics
 from tests.pipeline.made import made_job
 
 TINY = ("network.width=8", "network.depth=1", "network.heads=1")
@@ -71,6 +71,7 @@ def test_folder_holds_a_policy_with_its_origin(policy: Path, split: Path) -> Non
     assert loaded.origin["updates"] == 6
     assert loaded.origin["splits"][0]["split"] == str(split)
     assert (policy / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert_average_is_kept(policy, ".imitation.average", ".imitation.params")
 
 
 @pytest.mark.slow

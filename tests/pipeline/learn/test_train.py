@@ -22,7 +22,7 @@ from levelproof.pipeline.learn.folder import weights_digest
 from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.trained_on import levels_for
 from tests.pipeline.command import assert_refused, here
-from tests.pipeline.learn.runs import assert_guide_lists, metrics
+from tests.pipeline.learn.runs import assert_average_is_kept, assert_guide_lists, metrics
 
 LANES = (
     "ppo.environments=64",
@@ -70,6 +70,10 @@ def test_metrics_leave_out_numbers_that_do_not_exist(tmp_path: Path) -> None:
     log.write({module.COURSE.step: 1, "loss/value": 0.5, "train/solve_rate": np.nan})
     assert metrics(tmp_path) == [{module.COURSE.step: 1, "loss/value": 0.5}]
     assert (tmp_path / "curves.png").exists()
+
+
+def test_folder_holds_the_average_of_the_weights(agent: Path) -> None:
+    assert_average_is_kept(agent, ".average", ".params.policy")
 
 
 @pytest.mark.campaign
