@@ -1,7 +1,9 @@
 """Distilling a policy from teachers on a small real split, and continuing to the same bytes."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -20,6 +22,7 @@ from levelproof.pipeline.learn import distill as module
 from levelproof.pipeline.learn import kept_experts, sealed
 from levelproof.pipeline.learn.kept_experts import experts_of
 from levelproof.pipeline.learn.labelled import empty_labels, with_labels
+from levelproof.pipeline.learn.pool import LevelPool
 from levelproof.pipeline.store.checkpoints import begun_like, save_experts
 from levelproof.pipeline.store.layout import EXPERTS
 from tests.pipeline.command import assert_refused, here
@@ -128,6 +131,31 @@ def test_buffer_keeps_the_latest_transitions_and_none_without_a_label() -> None:
     alone = with_labels(empty_labels(8, 2), level, labels_of([50, 3, 2]), 1)
     assert alone.motion[:3].tolist() == [[0, 0], [0, 1], [0, 2]]
     assert with_labels(empty_labels(2, 2), level, labels_of([50, 3, 2]), 3).level.tolist() == [9, 9]
+
+
+def test_batches_mix_transitions_of_witnesses_and_of_teachers() -> None:
+    """A quarter of each is from witnesses, all if there are no labels; motion and actions say whose they are."""
+    steps = np.array([3, 1, 4, 2, 6])
+    rows, of_level = 1 + np.arange(steps.sum()), np.repeat(np.arange(len(steps)), steps)
+    six = lambda x: np.repeat(x[:, None], 6, 1).astype(np.int8)
+    index: Any = np.arange(len(steps))  # stands for the levels
+    pool = LevelPool(index, np.cumsum(steps) - steps, steps, np.stack([of_level, rows], 1), six(rows))
+    taught: Any = SimpleNamespace(level_ids=index, witnesses=pool)
+    taken, later = np.array([4, 0, 2, 2, 3, 1]), 100 + np.arange(6)
+    labels = empty_labels(8, 2)._replace(added=np.array(6, np.int32))
+    labels.level[:6], labels.motion[:6], labels.action[:6] = taken, np.stack([taken, later], 1), six(later)
+
+    config = DistillConfig(witnesses=0.25, train=replace(DistillConfig().train, batch=64))
+    several = list(module.batches(taught, labels, config, range(20)))
+    (alone,) = module.batches(taught, empty_labels(8, 2), config, range(1))
+    for batch, witnessed in [*((each, 16) for each in several), (alone, 64)]:
+        np.testing.assert_array_equal(batch.level, batch.motion[:, 0])
+        np.testing.assert_array_equal(batch.action.T, [batch.motion[:, 1]] * 6)
+        assert np.isin(batch.motion[:, 1], rows).sum() == witnessed
+        assert batch.motion.shape == (64, 2)
+    assert set(np.concatenate([each.motion[:, 1] for each in several])) == {*rows, *later}
+    (again,) = module.batches(taught, labels, config, range(2, 3))
+    np.testing.assert_array_equal(again.motion, several[2].motion)
 
 
 @pytest.mark.slow
