@@ -65,6 +65,7 @@ def test_import_labels_levels_by_replaying_the_actions(once: Path) -> None:
     rows, table = rows_of(split), read_manifest(split).table
     assert [row["label"] in ("solved", "trivial") for row in rows][:SOLVED] == whole[:SOLVED].tolist()
     assert {row["label"] for row in rows} == {"solved", "trivial", "unsolved"}
+    assert any("first imported episode, repeated" in row["label_reason"] for row in rows)
     for i, row in enumerate(rows):
         if row["label"] == "unsolved":
             assert (row["shard"], row["witness"], row["steps_to_goal"]) == (None, None, None)
