@@ -1,17 +1,21 @@
 """Choice of witness candidates, and statistics of evaluations."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
 from levelproof.experts.config import RECORD_STEPS, Choice, ExpertConfig
-from levelproof.experts.labels import Cause, Source
+from levelproof.experts.labels import Cause, Label, Source
 from levelproof.experts.training import progress
 from levelproof.experts.verdict.judge import (
     MAX_CANDIDATES,
     Evaluation,
+    TrainedLevel,
     Witness,
     candidates_of,
+    judge,
     repeated,
     shares,
     successful_episodes,
@@ -34,6 +38,21 @@ def evaluation(*episodes: list[tuple[int, bool]], success: int = 0, config: Expe
 
 def best_of(evaluations: list[Evaluation], source: Source, config: ExpertConfig) -> Witness | None:
     return next(iter(candidates_of(evaluations, source, config)), None)
+
+
+def test_witness_counts_only_if_its_replay_takes_as_many_steps() -> None:
+    """A replay that reaches the goal earlier or later, or not at all, solves nothing, nor does a missing witness."""
+    done, goal = np.zeros((2, RECORD_STEPS, 5), bool)
+    done[9] = goal[9] = True
+    goal[9, 3] = False
+    record: Any = SimpleNamespace(done=done, goal=goal)
+    witness = lambda steps: Witness(np.zeros((RECORD_STEPS, 6), int), Source.SAMPLED, steps)
+    chosen = [witness(10), witness(9), witness(11), witness(10), None]
+    trained = [TrainedLevel([], [evaluation([(9, True)])])] * 5
+    verdicts = judge(trained, chosen, record, CONFIG, np.array([True, False, True, False, True]))
+    assert [verdict.label for verdict in verdicts] == [Label.SOLVED, *[Label.UNSOLVED] * 4]
+    assert [verdict.steps_to_goal for verdict in verdicts] == [10, *[None] * 4]
+    assert [verdict.failed_by_noop for verdict in verdicts] == [True, False, True, False, True]
 
 
 def test_best_witness_is_the_first_attempt_without_failure() -> None:
