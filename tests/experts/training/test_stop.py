@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from levelproof.experts.config import ExpertConfig, Rule, StopConfig, check_budget
+from levelproof.experts.config import MAX_DOUBLINGS, ExpertConfig, Rule, StopConfig, check_budget
 from levelproof.experts.labels import Cause
 from levelproof.experts.training import progress, stop
 from levelproof.experts.training.stop import rules_of
@@ -117,6 +117,14 @@ def test_after_evaluation_decides_who_leaves_and_when_to_evaluate_next() -> None
     polished, leaves, deadline = decide(True, False, replace(SOLVED, polish=5 * 1024))
     assert (bool(polished.solved), bool(leaves), int(deadline)) == (True, False, 15)
     assert int(decide(True, False, replace(SOLVED, polish=1))[2]) == 11, "less than an update is an update"
+
+
+@pytest.mark.parametrize("failed", [0, 1, 5, MAX_DOUBLINGS, MAX_DOUBLINGS + 1, 100])
+def test_wait_doubles_with_each_failed_evaluation_up_to_a_limit(failed: int) -> None:
+    course, yes, no = stop.begin()._replace(failed=jnp.int32(failed)), jnp.bool_(True), jnp.bool_(False)
+    tried, _, _ = stop.after_evaluation(course, no, yes, no, jnp.int32(10**6), rules_of(SOLVED, CONFIG))
+    assert int(tried.next_evaluation) == 2 * 2 ** min(failed, MAX_DOUBLINGS)
+    assert int(tried.failed) == failed + 1
 
 
 def test_final_evaluation_leaves_no_trace_in_a_continued_expert() -> None:
