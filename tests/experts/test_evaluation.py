@@ -128,7 +128,11 @@ def test_players_draw_as_they_say(levels: Level) -> None:
     np.testing.assert_array_equal(play_sticky((), moment), even)  # nothing to repeat at the start
     going = moment._replace(now=task.TaskState(start.state, start.timestep + 1, start.last_distance))
     kept = np.asarray(moment.uniform) < STAY
-    assert (np.asarray(play_sticky((), going))[kept] == 1).all()
+    sticky = np.asarray(play_sticky((), going))
+    assert (sticky[kept] == 1).all()
+    drawn_again = np.asarray(evaluation.evenly((moment.uniform - STAY) / (1 - STAY)))
+    np.testing.assert_array_equal(sticky[~kept], drawn_again[~kept])
+    assert set(drawn_again[:4][~kept[:4]]) == {0, 1, 2}
     assert not np.asarray(do_nothing((), moment)).any()
 
 
