@@ -244,7 +244,6 @@ def test_examine_finds_missing_files(copied: Callable[[Path], Path], unsealed: P
     levels = files[shard / "zarr.json"]
     shutil.rmtree(shard)
     findings = examine(split)
-    assert findings.missing == [] or set(range(*findings.missing[0])) <= files[first]
     assert damaged_levels(findings) | {i for a, b in findings.missing for i in range(a, b + 1)} == files[first] | levels
     (split / JOB).unlink()
     assert any("the last command requested are unknown" in sentence for sentence in examine(split).sentences)
