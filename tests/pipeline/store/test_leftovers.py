@@ -11,10 +11,12 @@ from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.jobs import unit
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import commit
+from levelproof.pipeline.store import locks
 from levelproof.pipeline.store.layout import attempt_of, unit_name
 from levelproof.pipeline.store.leftovers import clean
 from levelproof.pipeline.store.locks import committing
 from levelproof.pipeline.store.manifest import fragment_paths
+from tests.pace import patience, wait_until
 from tests.pipeline.made import made_job, made_result
 
 
@@ -148,13 +150,19 @@ def test_clean_stops_at_a_damaged_fragment(split: Path, dead: str) -> None:
     assert everything(split) == before
 
 
-def test_clean_waits_for_a_running_commit(split: Path, dead: str) -> None:
+def test_clean_waits_for_a_running_commit(
+    split: Path, dead: str, messages: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A worker that outlives its killed run may be between its shard and its fragment."""
+    monkeypatch.setattr(locks, "NOTICE", 0.0)
     with ThreadPoolExecutor() as other:
         with committing(split):
-            cleaned = other.submit(clean, split, print)
+            cleaned = other.submit(clean, split, messages.append)
+            wait_until(lambda: messages, 30, "no word about the wait")
             with pytest.raises(TimeoutError):
-                cleaned.result(0.5)
+                cleaned.result(0.5)  # time in which it could remove the shard
             assert (split / f"shards/{dead}.zarr").is_dir()
-        cleaned.result(60)
+        cleaned.result(patience(60))
+    (sentence,) = messages
+    assert "Waiting for a worker of an earlier run" in sentence
     assert not (split / f"shards/{dead}.zarr").exists()
