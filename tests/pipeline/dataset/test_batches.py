@@ -92,16 +92,17 @@ def test_batches_stop_their_threads_when_collected(data: Dataset) -> None:
 
 
 def test_batches_read_ahead_exactly_prefetch_batches() -> None:
+    """The first one is returned while those ahead are still being read."""
     requested, go = [], threading.Event()
 
     def load(positions: range) -> range:
         requested.extend(positions)
-        go.wait(patience(10))
+        assert 0 in positions or go.wait(patience(10))
         return positions
 
     batches = Batches(load, None, {}, 3, None)
-    go.set()
     assert next(batches) == 0
+    go.set()
     wait_until(lambda: len(requested) >= 4, 10, requested)
     time.sleep(0.1)  # time in which a fifth batch could be requested
     assert sorted(requested) == [0, 1, 2, 3]
@@ -115,6 +116,7 @@ def test_batches_loaded_together_stay_within_prefetch() -> None:
     batches = Batches(lambda positions: requested.extend(positions) or positions, None, {}, 3, None, together=2)
     for position in range(6):
         assert next(batches) == position
+        wait_until(lambda position=position: len(requested) > position + 1, 10, requested)  # something is read ahead
         time.sleep(0.05)  # time in which too much could be requested
         assert len(requested) <= position + 1 + 3
     batches.close()
