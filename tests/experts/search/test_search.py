@@ -286,7 +286,7 @@ def test_explore_leaves_solved_levels_unchanged() -> None:
 
 
 def test_full_archive_widens_its_cells() -> None:
-    """Entries stay distinct, and their actions reach them."""
+    """Entries stay distinct."""
     now = begun()
     for _ in range(4):
         now = explore(now, CONFIG, DEFAULT_RULES)
@@ -299,6 +299,19 @@ def test_full_archive_widens_its_cells() -> None:
         keys = archive.key[level][archive.used[level]]
         assert len(set(keys.tolist())) == len(keys)
         assert archive.used[level].any()
+
+
+def test_search_notes_when_its_last_cell_entered() -> None:
+    """The end of that round; 0 if only the first state was reached."""
+    now = jax.device_get(begun())
+    for _ in range(4):
+        before, now = now, jax.device_get(explore(jax.tree.map(jnp.array, now), CONFIG, DEFAULT_RULES))
+        grown = now.archive.cells > before.archive.cells
+        np.testing.assert_array_equal(now.grew[~grown], before.grew[~grown])
+        assert (now.grew[grown] > before.env_steps[grown]).all()
+        assert (now.grew[grown] <= now.env_steps[grown]).all()
+    kinds = KINDS[: len(now.grew)]
+    np.testing.assert_array_equal(now.grew > 0, kinds != BROKEN)
 
 
 def test_broken_world_archives_only_its_start() -> None:
