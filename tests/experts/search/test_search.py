@@ -312,6 +312,7 @@ def test_search_notes_when_its_last_cell_entered() -> None:
         assert (now.grew[grown] <= now.env_steps[grown]).all()
     kinds = KINDS[: len(now.grew)]
     np.testing.assert_array_equal(now.grew > 0, kinds != BROKEN)
+    assert (now.grew == now.env_steps).any(), "some grew in their last round"
 
 
 def test_broken_world_archives_only_its_start() -> None:
