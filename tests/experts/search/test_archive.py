@@ -25,7 +25,8 @@ def states(positions: Any, steps: Any, distances: Any = 0.0) -> ReachedStates:
     code = np.repeat(steps[..., None], STEPS, axis=-1).astype(np.uint16)
     feature = np.asarray(positions, np.float32)[None, :, None]
     distance = np.broadcast_to(np.float32(distances), steps.shape)
-    return jax.tree.map(jnp.array, ReachedStates(feature, steps[..., None].astype(np.float32), code, steps, distance))  # pyright: ignore
+    columns = feature, steps[..., None].astype(np.float32), code, steps, distance
+    return ReachedStates(*map(jnp.array, columns))
 
 
 def archive_of(visits: list[int], distances: list[float]) -> Archive:

@@ -11,7 +11,7 @@ import pytest
 
 import levelproof
 from benchmarks.published import write as write_published
-from levelproof.experts.evaluation import do_nothing, play, play_most_probable, play_sampled
+from levelproof.experts.evaluation import do_nothing, play
 from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy
 from levelproof.experts.networks.saved import Policy, save_policy
 from levelproof.levelgen.batching import take
@@ -22,7 +22,7 @@ from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.exchange.level_json import export
-from levelproof.pipeline.learn import evaluate, published
+from levelproof.pipeline.learn import published
 from levelproof.pipeline.learn.looks import LOOKS, log_look
 from levelproof.pipeline.learn.measured import levels_in, midway_levels
 from levelproof.pipeline.learn.sealed import SEALED, known_sealed
@@ -157,15 +157,6 @@ def test_folder_of_splits_is_named(split: Path, tmp_path: Path) -> None:
 )
 def test_command_refuses(tmp_path: Path, words: list[str], sentence: str) -> None:
     assert_refused(here(["evaluate", *words], tmp_path), 2, sentence)
-
-
-def test_rows_of_a_policy_are_named_by_how_it_plays() -> None:
-    one = evaluate._contestant(Path("builtin:s"), "policy")
-    assert one.policy
-    players = play_sampled(one.policy.network), play_most_probable(one.policy.network)
-    assert [*one.entrants] == [one.main, "policy, greedy"] == ["policy, sampled", "policy, greedy"]
-    assert tuple(entrant.player for entrant in one.entrants.values()) == players
-    assert [entrant.chance for entrant in one.entrants.values()] == [True, False]
 
 
 @pytest.mark.slow
