@@ -74,8 +74,9 @@ def run(args: argparse.Namespace) -> Report:
             f"The first {TRAJECTORIES:,} trajectories of each folder, from the page cache, with programs compiled "
             "before. *Seeds* are simulated, *full* shards decoded. *First episodes* come from "
             "`Dataset.episode_batches`; *records* from `Dataset.read`, whole ones of 256 steps, of which the first "
-            "episode counts here. The *reference* returns such records with every array copied, without an "
-            "observation. *Lanes* plays random actions with observations, and reads nothing.",
+            "episode counts here. The *reference* returns such records; every array is copied, and its own jitted "
+            "symbolic observation is made of the states. *Lanes* plays random actions with observations, and reads "
+            "nothing.",
             f"Bytes per trajectory: those of *{RELEASED}* are {RECORD_STEPS} times the bytes of a transition in its 1M "
             f"split of this size; those of `full`, `resume` and `witness` {RECORD_STEPS} times what storage.md "
             "measured on witnesses of experts alone, which are longer than those of a search; those of `seed` are of "
@@ -218,11 +219,15 @@ def read(seeds: Path, part: Path, split: Path, seconds: float, alone: bool) -> t
     if not alone:
         python, kinetix = oracle.oracle_python(), split.with_name("kinetix")
         oracle.run_levelproof("export", split, "--format", "kinetix", "--where", "shard IS NOT NULL", "-o", kinetix)
-        arguments = [kinetix, "--batch", BATCH, "--seconds", seconds]
+        kept = split.with_name("kept")
+        arguments = [kinetix, "--batch", BATCH, "--seconds", seconds, "--keep", kept]
         theirs = json.loads(oracle.run_script(python, "batches", arguments, "read trajectories with the reference"))
-        steps = np.mean(levelproof.open(split).manifest["steps_to_goal"].to_numpy())
-        copied = theirs["core_copied"]
-        rates["reference"] = {"transitions": float(copied * steps), "trajectories": copied}
+        arguments = [kept, "--size", split.name, "--seconds", seconds]
+        observed = json.loads(oracle.run_script(python, "observed", arguments, "observe with the reference"))
+        steps = float(np.mean(levelproof.open(split).manifest["steps_to_goal"].to_numpy()))
+        read, seen = theirs["core_copied"], 1 / (1 / theirs["core_copied"] + observed["core"])
+        rates |= {name: {"transitions": rate * steps, "trajectories": rate}
+                  for name, rate in (("reference, not observed", read), ("reference", seen))}  # fmt: skip
         versions = oracle.versions(python)
     return rates | {"Lanes": {"transitions": of_lanes(split.name, seconds)}}, versions
 

@@ -7,13 +7,16 @@ that the queue stays empty, the rate is sustainable, and memory stays small.
 
 import argparse
 import json
+import pickle
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 WARM = 24  # batches before the clock starts
+KEPT = 4  # batches whose states are kept
 
 
 def rates(next_batch: Callable[[], Any], arrays: Callable[[Any], list], batch: int, seconds: float) -> dict[str, float]:
@@ -46,6 +49,7 @@ def main() -> None:
     parser.add_argument("folder")
     parser.add_argument("--batch", type=int, required=True)
     parser.add_argument("--seconds", type=float, required=True)
+    parser.add_argument("--keep", type=Path, help="file for the states of some batches")
     args = parser.parse_args()
 
     import jax
@@ -58,6 +62,8 @@ def main() -> None:
     for _ in range(WARM):
         manager.load_next_batch()
     print(json.dumps({"first": first} | rates(manager.load_next_batch, jax.tree.leaves, args.batch, args.seconds)))
+    if args.keep:
+        args.keep.write_bytes(pickle.dumps([manager.load_next_batch().env_state for _ in range(KEPT)]))
 
 
 if __name__ == "__main__":
