@@ -16,29 +16,30 @@ from typing import Any
 import numpy as np
 
 WARM = 24  # batches before the clock starts
-KEPT = 4  # batches whose states are kept
+KEPT, ROUNDS = 4, 3  # batches that are copied, and how often; also those whose states are kept
 
 
 def rates(next_batch: Callable[[], Any], arrays: Callable[[Any], list], batch: int, seconds: float) -> dict[str, float]:
     """Measure trajectories/s and, as `core_...`, per second of CPU time: as read, and with every array copied.
 
-    Copies are timed by the CPU time of their own thread: a caller that copies is slower than the readers, which then
-    read ahead for batches that nobody takes.
+    Copies are timed by the CPU time of their own thread, and few: a caller that copies is slower than the readers,
+    which then fill the memory with batches that nobody takes.
     """
-    start, cpu_start, count = time.perf_counter(), time.process_time(), 0
-    while time.perf_counter() - start < seconds:
-        next_batch()
-        count += batch
-    reading, of_core = (time.perf_counter() - start) / count, (time.process_time() - cpu_start) / count
-    start, copying, count = time.perf_counter(), 0.0, 0
-    while time.perf_counter() - start < seconds:
-        read = arrays(next_batch())
-        before = time.thread_time()
-        for array in read:
-            np.ascontiguousarray(array)
-        copying += time.thread_time() - before
-        count += batch
-    copying /= count
+
+    def read() -> tuple[float, float]:
+        start, cpu_start, count = time.perf_counter(), time.process_time(), 0
+        while time.perf_counter() - start < seconds:
+            next_batch()
+            count += batch
+        return (time.perf_counter() - start) / count, (time.process_time() - cpu_start) / count
+
+    read()  # empties the queue
+    reading, of_core = read()
+    some = [array for _ in range(KEPT) for array in arrays(next_batch())]
+    before = time.thread_time()
+    for array in some * ROUNDS:
+        np.ascontiguousarray(array)
+    copying = (time.thread_time() - before) / (KEPT * ROUNDS * batch)
     names = ("rate", "core_rate", "copied", "core_copied")
     times = (reading, of_core, reading + copying, of_core + copying)
     return {name: 1 / taken for name, taken in zip(names, times, strict=True)}
