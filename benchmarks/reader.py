@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> Report:
         notes=[
             f"Random batches of {BATCH} whole trajectories with every field, after {WARM} to warm up; the reference "
             "draws runs of neighbours, our reader draws trajectories one by one. Both return arrays (batch, time, ...) "
-            "that are views of what they decoded; the second table includes a copy of every array.",
+            "that are views of what they decoded; the second table adds the CPU time of copying every array.",
             f"Targets for *full* in the second table: {', '.join(f'{n}x for {size}' for size, n in TARGETS.items())}. "
             f"{'Missed by ' + ', '.join(missed) if missed else 'All are met'}.",
         ],
