@@ -25,16 +25,16 @@ NO_MATCH = "No level", "no trajectories", "holds for none", "too few levels"  # 
 def smaller(line: str) -> list[str]:
     """Return the arguments of a command, with budgets and levels that take seconds."""
     for budget, small in BUDGETS.items():
-        line = re.sub(rf"\b{budget}\b", small, line)
+        line = re.sub(rf"(?<!manifests/)\b{budget}\b", small, line)
     words = [re.sub(r"^levels=\d.*", f"levels={LEVELS}", word) for word in shlex.split(line, comments=True)[1:]]
     words = words[: words.index(">")] if ">" in words else words  # without a shell's redirection
+    committed = "level_id < 60" if any("manifests/" in word for word in words) else ""
     unlimited = words[0] == "generate" and not any(word.startswith(("levels=", "level_files=", "-")) for word in words)
     if words[0] == "clone":
         words = [word for word in words if not word.startswith(("train.", "where="))]
-        few = "level_id < 60" if any("manifests/" in word for word in words) else ""
-        words += ["train.updates=4", "train.batch=32", "validation=0.5", "played=8", f"where={few}"]
+        words += ["train.updates=4", "train.batch=32", "validation=0.5", "played=8", f"where={committed}"]
     if words[0] == "distill":
-        words += ["train.updates=4", "interval=2", "train.batch=32", "episodes=4", "states=4", "where="]
+        words += ["train.updates=4", "interval=2", "train.batch=32", "episodes=4", "states=4", f"where={committed}"]
     if words[0] == "train":
         words = [word for word in words if not word.startswith("ppo.env")]
         words += ["ppo.environments=32", "ppo.env_steps=2048", "ppo.minibatches=4"]
