@@ -9,6 +9,7 @@ import hashlib
 import itertools
 import json
 import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -146,6 +147,12 @@ def lines_of(policy: Path) -> list[dict[str, float]]:
 def command(*words: Any) -> str:
     """Run a command; return its output. Raise Failure with the last line of its errors if it fails."""
     return timed_command(*words)[0]
+
+
+def children_seconds() -> float:
+    """Return user and system seconds of all child processes that have ended."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
 
 
 def timed_command(*words: Any) -> tuple[str, float]:

@@ -6,7 +6,6 @@ this environment. A small job goes before each, so that nothing is left to compi
 
 import argparse
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -17,6 +16,7 @@ from typing import Any
 
 import pyarrow.dataset as ds
 
+from benchmarks.cloning import children_seconds
 from benchmarks.oracle import log
 from benchmarks.report import Report, Table
 from benchmarks.solved.results import share
@@ -121,22 +121,16 @@ def generated(sources: Path, settings: Sequence[str]) -> dict[str, Any]:
             CACHE_VARIABLE: str(cache_folder() / "cost" / sources.name),
         }
         environment.pop("PYTHONDONTWRITEBYTECODE", None)  # Python would compile all sources in every run
-        before = _cpu_seconds()
+        before = children_seconds()
         # Python looks for modules in the working directory first
         done = subprocess.run(command, cwd=sources, env=environment, capture_output=True, text=True)
-        seconds = _cpu_seconds() - before
+        seconds = children_seconds() - before
         if done.returncode:
             words = " ".join(command[3:])
             raise Failure(f"`levelproof {words}` in {sources} fails with {done.returncode}:\n{done.stderr[-2000:]}")
         manifests = [str(path) for path in Path(out).glob("*/*/manifest")]
         rows = [ds.dataset(path, format="parquet").to_table(["level_id", "label"]).to_pylist() for path in manifests]
     return {"seconds": seconds, "labels": {row["level_id"]: row["label"] for each in rows for row in each}}
-
-
-def _cpu_seconds() -> float:
-    """Return user and system seconds of all children that have ended."""
-    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return usage.ru_utime + usage.ru_stime
 
 
 def _cost(result: Mapping[str, Any], commit: str) -> list[str]:

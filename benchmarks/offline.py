@@ -5,7 +5,6 @@ A stopped run resumes: the folder keeps trained networks and finished evaluation
 
 import argparse
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -13,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.cloning import SAMPLED, command, interval_text, kept
+from benchmarks.cloning import SAMPLED, children_seconds, command, interval_text, kept
 from benchmarks.learners import lines_of, slug
 from benchmarks.report import Report, Table
 from levelproof.pipeline.errors import Failure
@@ -100,7 +99,7 @@ def learned(args: argparse.Namespace, data: str, way: str, seed: int) -> dict[st
 
 def trained(script: Path, datasets: Path, *words: Any) -> float:
     """Run TorchRL's training; return its CPU seconds. Raise Failure with the last line of its errors if it fails."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    before = children_seconds()
     done = subprocess.run(
         [sys.executable, script, *map(str, words)],
         env={**os.environ, "MINARI_DATASETS_PATH": str(datasets.absolute())},
@@ -110,8 +109,7 @@ def trained(script: Path, datasets: Path, *words: Any) -> float:
     )
     if done.returncode:
         raise Failure(f"{script} failed: {done.stderr.strip().splitlines()[-1]}")
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return children_seconds() - before
 
 
 def row_of(each: Mapping[str, Any]) -> list[str]:

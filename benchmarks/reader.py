@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import oracle
-from benchmarks.reference.batches import WARM
 from benchmarks.report import Report, Table
 from levelproof.levelgen.level import SIZES
 from levelproof.pipeline.runtime import cache_folder
@@ -45,9 +44,9 @@ def run(args: argparse.Namespace) -> Report:
         results=results,
         tables=[table(results, what, title) for what, title in TABLES.items()],
         notes=[
-            f"Random batches of {BATCH} whole trajectories with every field, after {WARM} to warm up; the reference "
-            "draws runs of neighbours, our reader draws trajectories one by one. Both return arrays (batch, time, ...) "
-            "that are views of what they decoded; the second table adds the CPU time of copying every array.",
+            f"Random batches of {BATCH} whole trajectories with every field, after as many seconds to warm up; the "
+            "reference draws runs of neighbours, our reader draws trajectories one by one. Both return arrays (batch, "
+            "time, ...) that are views of what they decoded; the second table adds the CPU time of copying each array.",
             f"Targets for *full* in the second table: {', '.join(f'{n}x for {size}' for size, n in TARGETS.items())}. "
             f"{'Missed by ' + ', '.join(missed) if missed else 'All are met'}.",
         ],

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 import levelproof
-from benchmarks.reference.batches import WARM, rates
+from benchmarks.reference.batches import rates
 
 
 def main() -> None:
@@ -23,8 +23,6 @@ def main() -> None:
     next_batch = lambda: next(batches)
     next_batch()
     first = time.perf_counter() - start
-    for _ in range(WARM):
-        next_batch()
     arrays = lambda batch: [x for x in jax.tree.leaves(batch) if isinstance(x, np.ndarray)]
     print(json.dumps({"first": first} | rates(next_batch, arrays, args.batch, args.seconds)))
 

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-WARM = 24  # batches before the clock starts
 KEPT, ROUNDS = 4, 3  # batches that are copied, and how often; also those whose states are kept
 
 
@@ -33,7 +32,7 @@ def rates(next_batch: Callable[[], Any], arrays: Callable[[Any], list], batch: i
             count += batch
         return (time.perf_counter() - start) / count, (time.process_time() - cpu_start) / count
 
-    read()  # empties the queue
+    read()  # warms up, and empties the queue
     reading, of_core = read()
     some = [array for _ in range(KEPT) for array in arrays(next_batch())]
     before = time.thread_time()
@@ -60,8 +59,6 @@ def main() -> None:
     manager = TrajectoryDatasetManager(args.folder, args.batch, seed=0)
     manager.load_next_batch()
     first = time.perf_counter() - start
-    for _ in range(WARM):
-        manager.load_next_batch()
     print(json.dumps({"first": first} | rates(manager.load_next_batch, jax.tree.leaves, args.batch, args.seconds)))
     if args.keep:
         args.keep.write_bytes(pickle.dumps([manager.load_next_batch().env_state for _ in range(KEPT)]))

@@ -84,7 +84,7 @@ class CurriculumConfig:
     every: int = 100  # updates between measurements
     candidates: int = 1024  # levels that are measured, drawn from all
     measured_steps: int = 1024  # env steps of a measurement in each level; episodes have up to 256
-    keep: int = 256  # levels with the highest learnability, p(1 - p) of the solve rate p, that are kept
+    keep: int = 256  # levels that are kept, those with the highest learnability
 
     def __post_init__(self) -> None:
         require(self, ("share",), 0, 1)
