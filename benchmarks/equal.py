@@ -44,6 +44,7 @@ CLONE = "clone"
 SEARCHING = Lock()  # several ways share levels and a clone
 WAYS = {
     "from scratch": Way(SCRATCH, colour="#0072b2"),
+    "from scratch, by default": Way(("network.width=64",), colour="#332288"),
     "from scratch, learnability": Way((*SCRATCH, "levels=learnability"), colour="#56b4e9"),
     "levels, reinforcement on these levels": Way(SCRATCH, colour="#000000", own_levels=True),
     "levels, clone, reinforcement": Way(TUNING, CLONE, "#d55e00"),
