@@ -9,7 +9,7 @@ import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -36,6 +36,7 @@ FEW, MANY = 64, 512  # episodes: up to FEW have a small program; from MANY on th
 AT_ONCE = 2 * MANY  # most episodes that are played together
 STEPS = 128  # maximum env steps per lane in one call of a program
 STEPS_WITH_PIXELS = 8  # an image has 188 kB
+T = TypeVar("T")
 
 
 class PlayedEpisodes(NamedTuple):
@@ -228,7 +229,16 @@ def checksum_of(states: TaskState, steps: Int[np.ndarray, " level"]) -> UInt32[n
     return total
 
 
-def repeat_episodes(rows: np.ndarray, steps: Int[np.ndarray, " level"]) -> np.ndarray:
-    """Fill records [level, 256, ...] with copies of their first episodes, rows [row, ...] one episode after another."""
+def repeat_episodes(rows: T, steps: Int[np.ndarray, " level"]) -> T:
+    """Fill records with copies of their first episodes.
+
+    Args:
+        rows: arrays [row, ...] of env steps, one episode after another.
+        steps: lengths of the episodes, env steps.
+
+    Returns:
+        Arrays [level, 256, ...].
+    """
     first = np.cumsum(steps) - steps
-    return rows[first[:, None] + np.arange(RECORD_STEPS) % steps[:, None]]
+    row = first[:, None] + np.arange(RECORD_STEPS) % steps[:, None]
+    return jax.tree.map(lambda x: x.take(row, 0), rows)

@@ -36,7 +36,7 @@ class Batch:
         first: step of the record at which each window starts, int64 [batch].
         mask: bool [batch, time]; False for padding, whose steps repeat others, and for levels that are left out
             (`levelproof.open`).
-        observation: of the requested type, jax arrays [batch, time, ...] (`symbolic_flat`: float32 [batch, time,
+        observation: of the requested type, [batch, time, ...] (`symbolic_flat`: float32 [batch, time,
             feature]); None if none was requested.
         action: multi-discrete codes (`levelgen.task.actions`), int32 [batch, time, 6].
         action_mask: entries of an action that can have an effect in the level, bool [batch, time, 6].

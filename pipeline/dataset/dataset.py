@@ -17,13 +17,14 @@ from levelproof.levelgen.level import Level, size_of
 from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.environment import EnvState
 from levelproof.levelgen.task.observe.kinds import ObservationType
-from levelproof.physics.types import Size, State
-from levelproof.pipeline.dataset.batch import Batch, expand_fields, require_steps, state_in, timed_out, whole_numbers
+from levelproof.physics.types import Size
+from levelproof.pipeline.dataset.batch import Batch, expand_fields, require_steps, state_in, whole_numbers
 from levelproof.pipeline.dataset.batches import Batches, batches_of
 from levelproof.pipeline.dataset.differing import KEEP, Differing
 from levelproof.pipeline.dataset.episodes import EpisodeBatch, gather_episodes
-from levelproof.pipeline.dataset.observations import observe, parse_observation
+from levelproof.pipeline.dataset.observations import parse_observation
 from levelproof.pipeline.dataset.order import EpochOrder
+from levelproof.pipeline.dataset.records import gather_windows
 from levelproof.pipeline.dataset.renamed import renamed
 from levelproof.pipeline.dataset.sources import TrajectorySource
 from levelproof.pipeline.dataset.subsets import check_share, in_subset
@@ -157,17 +158,18 @@ class Dataset:
         indices = np.atleast_1d(whole_numbers(indices, "indices"))
         starts = np.broadcast_to(whole_numbers(first, "first steps"), indices.shape)
         require_steps(starts)
-        needed = [*chosen, *ALWAYS_FIELDS, *expand_fields(["level", *(["record/state"] if kind else [])], self.size)]
-        whole = self._arrays(indices, needed)
-        late = timed_out(whole["record/done"], whole["record/goal"], self.rules.max_timesteps)
-        arrays = windows.cut(whole | {"record/truncated": late}, starts)
+        needed = list(dict.fromkeys([*chosen, *ALWAYS_FIELDS, *expand_fields("level", self.size)]))
+        gather = lambda rows: gather_windows(
+            self.split, rows, windows, starts, needed, kind, self.rules.max_timesteps, self._shard, self._differing.note
+        )
+        arrays, shown = self._trajectories.gathered(indices, gather)
         level, level_id = tree_of(Level, arrays, "level/"), self._trajectories.level_ids(indices)
         effective = action_mask(jax.tree.map(lambda x: np.moveaxis(x, 0, -1), level)).T[:, None]
         return Batch(
             level_id=level_id,
             first=starts,
             mask=windows.mask(starts) & self._differing.kept(level_id)[:, None],
-            observation=observe(kind, level, tree_of(State, arrays, "record/state/")) if kind else None,
+            observation=shown,
             action=arrays["record/action"],
             action_mask=np.broadcast_to(effective, arrays["record/action"].shape),
             reward=arrays["record/reward"],

@@ -30,9 +30,9 @@ def parse_observation(name: str | None) -> ObservationType | None:
 
 
 def observe(kind: ObservationType, level: Level, states: State) -> Any:
-    """Observe levels [batch, ...] in states [batch, time, ...]; return jax arrays [batch, time, ...]."""
+    """Observe levels [batch, ...] in states [batch, time, ...]; return numpy arrays [batch, time, ...]."""
     with COMPILING:
-        return _observe(kind, level, states)
+        return jax.device_get(_observe(kind, level, states))
 
 
 def observe_rows(kind: ObservationType, level: Level, row_level: Int[np.ndarray, " row"], states: State) -> Any:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -149,6 +150,28 @@ def test_seed_records_repeat_their_first_episode(seed: Path) -> None:
     for name, values in batch.fields.items():
         first = values[np.arange(RECORD_STEPS) < steps[:, None]]
         assert_same({name: repeat_episodes(first, steps)}, {name: values})
+
+
+@pytest.mark.parametrize(
+    ("kind", "length", "first"),
+    [
+        ("symbolic_flat", None, 0),
+        ("symbolic_flat", 9, [0, 250, 30]),  # the second is padded
+        ("symbolic_flat", None, [0, 3, 250]),
+        pytest.param("symbolic_entity", None, 0, marks=pytest.mark.slow),
+        pytest.param("symbolic_flat_padded", 9, [0, 250, 30], marks=pytest.mark.slow),
+        pytest.param("pixels", 3, [0, 255, 30], marks=pytest.mark.slow),
+    ],
+)
+def test_seeds_read_as_the_split_that_they_grow_into(
+    seed: Path, grown: Path, kind: str, length: int | None, first: int | list[int]
+) -> None:
+    fields = ["level", "record/state", "record/timestep"]
+    ours, theirs = (levelproof.open(path).read([4, 0, 4], length, first, fields, kind) for path in (seed, grown))
+    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(ours), jax.tree.leaves(theirs), strict=True):
+        assert isinstance(a, np.ndarray)
+        assert (a.dtype, a.shape) == (b.dtype, b.shape), path
+        np.testing.assert_array_equal(a, b, str(path))
 
 
 def test_seed_manifest_has_the_columns_of_its_split(split: Path, seed: Path) -> None:
