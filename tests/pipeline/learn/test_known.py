@@ -15,9 +15,11 @@ from tests.pipeline.command import here
 @pytest.mark.campaign
 @pytest.mark.parametrize("size", [name for name in SIZES if known_sealed(name)])
 def test_known_sealed_levels_are_what_a_job_makes_of_them(size: str, tmp_path: Path) -> None:
-    """Labels of a machine differ where training ends otherwise: of 32 levels hardly any does.
+    """Experts trained on another processor differ in the last bits of their weights, and so in single attempts.
 
-    Of l, 5 experts have other successes on an Intel processor than on the AMD that made what is known.
+    On an AMD EPYC of 2026-11-28, experts of 3, 2 and 6 of these levels of s, m and l solved other numbers of their 16
+    attempts than are known: 0.19, 0.09 and 0.38 attempts per level on average. Between different levels it is about 5.
+    How many levels differ says less: an expert that hardly ever succeeds has 0 or 1 by chance.
     """
     then = "search.bodies=7 search.patience=393216 search.patience_gap=0"  # the defaults when they were labelled
     job = f"generate size={size} first_level={SEALED.start} levels=32 budget=256k executor=inline {then}"
@@ -27,5 +29,6 @@ def test_known_sealed_levels_are_what_a_job_makes_of_them(size: str, tmp_path: P
     assert known is not None
     made = np.array(table["label"].to_pylist()) == "solved"
     assert (made != known.solved[:32]).sum() <= 2
-    successes = successes_of(table, 16)
-    assert (successes != known.successes["256k"][:32]).sum() <= (5 if size == "l" else 4)
+    successes, expected = successes_of(table, 16).astype(int), known.successes["256k"][:32].astype(int)
+    assert np.abs(successes - expected).mean() <= 1
+    assert np.abs(successes - np.roll(expected, 1)).mean() > 2, "other levels would show"
