@@ -170,6 +170,23 @@ def timed_command(*words: Any) -> tuple[str, float]:
         return output.read(), used.ru_utime + used.ru_stime
 
 
+def timed_split(out: Path, *words: Any) -> float:
+    """Generate a split in `out`, unless an earlier run has; return the CPU seconds that it took.
+
+    A split's own ledger has seconds of a clock, which other work on the machine makes longer.
+
+    Raises:
+        Failure: a run that was stopped has left a part of the levels, whose seconds nobody knows.
+    """
+    file = out.with_suffix(".json")
+    if not file.exists():
+        if out.exists():
+            raise Failure(f"{out} was left by a run that was stopped: remove it, so that its search counts as a whole.")
+        seconds = timed_command("generate", *words, f"out={out}", "executor=inline")[1]
+        file.write_text(json.dumps({"core_seconds": seconds}))
+    return json.loads(file.read_text())["core_seconds"]
+
+
 def row_of(kind: tuple[str, int], results: list[dict[str, Any]]) -> list[str]:
     variant, count = kind
     ways = [("sealed", *way) for way in COLUMNS.values()] + [("seen", ALL, SAMPLED, "once")]

@@ -5,7 +5,6 @@ continues what it left, training from its checkpoint, and the folder keeps finis
 """
 
 import argparse
-import json
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -13,11 +12,10 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
 
-from benchmarks.cloning import SAMPLED, command, kept, lines_of, timed_command
+from benchmarks.cloning import SAMPLED, command, kept, lines_of, timed_split
 from benchmarks.learners import ATTEMPTS, RATE, SECONDS, STEPS, add_ways, rates_text, slug
 from benchmarks.plotting import pyplot
 from benchmarks.report import Report, Table
-from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.learn.evaluate import ALL, SOLVED
 from levelproof.pipeline.runtime import own_cores
 
@@ -125,22 +123,9 @@ def cloned(args: argparse.Namespace, seed: int) -> tuple[Path, float]:
 
 
 def searched(args: argparse.Namespace, seed: int) -> float:
-    """Search levels; return the CPU seconds that it took.
-
-    A split's own ledger has seconds of a clock, which other work on the machine makes longer.
-
-    Raises:
-        Failure: a run that was stopped has left a part of the levels, whose seconds nobody knows.
-    """
-    out = split_of(args, seed).parents[1]
-    file = out.with_suffix(".json")
-    if not file.exists():
-        if out.exists():
-            raise Failure(f"{out} was left by a run that was stopped: remove it, so that its search counts as a whole.")
-        job = f"levels={args.levels}", f"size={args.size}", f"first_level={FIRST + BETWEEN_SEEDS * seed}"
-        words = *job, f"out={out}", "procedure=label", "budget=16k", "executor=inline"
-        file.write_text(json.dumps({"core_seconds": timed_command("generate", *words)[1]}))
-    return json.loads(file.read_text())["core_seconds"]
+    """Search levels; return the CPU seconds that it took. Raises as `timed_split`."""
+    job = f"levels={args.levels}", f"size={args.size}", f"first_level={FIRST + BETWEEN_SEEDS * seed}"
+    return timed_split(split_of(args, seed).parents[1], *job, "procedure=label", "budget=16k")
 
 
 def settings_of(args: argparse.Namespace, way: str, seed: int) -> Sequence[str]:
