@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> Report:
             "first episodes; the rest of a released record of 256 steps is further episodes of the same expert.",
             f"The first {TRAJECTORIES:,} trajectories of each folder, from the page cache, with programs compiled "
             "before. *Seeds* are simulated, *full* shards decoded. *First episodes* come from "
-            "`Dataset.episode_batches`; *records* from `Dataset.read`, whole ones of 256 steps, of which the first "
+            "`Dataset.episode_batches`; *records* from `Dataset.batches`, whole ones of 256 steps, of which the first "
             "episode counts here. The *reference* returns such records; every array is copied, and its own jitted "
             "symbolic observation is made of the states. *Lanes* plays random actions with observations, and reads "
             "nothing.",
@@ -243,14 +243,11 @@ def of_episodes(path: Path, seconds: float) -> dict[str, float]:
 def of_records(path: Path, seconds: float) -> dict[str, float]:
     """Read random batches of records; return transitions of first episodes and trajectories per second of CPU time."""
     data = levelproof.open(path)
-    steps, draw = data.manifest["steps_to_goal"].to_numpy(), np.random.default_rng(0)
-
-    def batch() -> int:
-        chosen = draw.choice(len(data), BATCH)
-        data.read(chosen, observation=OBSERVATION)
-        return int(steps[chosen].sum())
-
-    transitions, count, spent = repeated(batch, seconds)
+    ids, steps = (data.manifest[name].to_numpy() for name in ("level_id", "steps_to_goal"))
+    batches = data.batches(BATCH, seed=0, observation=OBSERVATION, epochs=None)
+    work = lambda: int(steps[np.searchsorted(ids, next(batches).level_id)].sum())
+    transitions, count, spent = repeated(work, seconds, EPISODES_AT_ONCE // BATCH)
+    batches.close()
     return {"transitions": transitions / spent, "trajectories": count * BATCH / spent}
 
 

@@ -9,7 +9,7 @@ import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +36,6 @@ FEW, MANY = 64, 512  # episodes: up to FEW have a small program; from MANY on th
 AT_ONCE = 2 * MANY  # most episodes that are played together
 STEPS = 128  # maximum env steps per lane in one call of a program
 STEPS_WITH_PIXELS = 8  # an image has 188 kB
-T = TypeVar("T")
 
 
 class PlayedEpisodes(NamedTuple):
@@ -121,7 +120,10 @@ def _table(level: Level) -> Level:
     """Copy levels to the device, padded, so that three programs serve any number of them."""
     count = len(level)
     room = FEW if count <= FEW else MANY if count < MANY else AT_ONCE
-    return jax.device_put(take(level, np.minimum(np.arange(room), count - 1)))
+    return _on_device(take(level, np.minimum(np.arange(room), count - 1)))
+
+
+_on_device = jax.jit(lambda level: level)  # `jax.device_put` takes four times as long for so many small arrays
 
 
 def _moves_of(action: Int[np.ndarray, "256 6 level"], steps: Int[np.ndarray, " level"]) -> _Moves:
@@ -229,16 +231,7 @@ def checksum_of(states: TaskState, steps: Int[np.ndarray, " level"]) -> UInt32[n
     return total
 
 
-def repeat_episodes(rows: T, steps: Int[np.ndarray, " level"]) -> T:
-    """Fill records with copies of their first episodes.
-
-    Args:
-        rows: arrays [row, ...] of env steps, one episode after another.
-        steps: lengths of the episodes, env steps.
-
-    Returns:
-        Arrays [level, 256, ...].
-    """
+def repeated_rows(steps: Int[np.ndarray, " level"]) -> Int[np.ndarray, "level 256"]:
+    """Return which row each step of a record copies, where rows are first episodes of `steps`, one after another."""
     first = np.cumsum(steps) - steps
-    row = first[:, None] + np.arange(RECORD_STEPS) % steps[:, None]
-    return jax.tree.map(lambda x: x.take(row, 0), rows)
+    return first[:, None] + np.arange(RECORD_STEPS) % steps[:, None]

@@ -22,32 +22,35 @@ class Batches(Iterator[T], Generic[T]):
 
     def __init__(
         self,
-        load: Callable[[range], Sequence[T]],
+        load: Callable[[range], Sequence[Any]],
         count: int | None,
         settings: Mapping[str, Any],
         prefetch: int,
         start: Any,
         together: int = 1,
+        finish: Callable[[Any], T] = lambda loaded: loaded,
     ) -> None:
         """Start iterating, and prefetching.
 
         Args:
-            load: returns the batches at consecutive positions; called in threads.
+            load: returns what makes the batches at consecutive positions; called in threads.
             count: number of batches; None: endless.
             settings: arguments that determine the sequence of batches, as JSON.
             prefetch: number of batches to read ahead.
             start: a result of `state` to resume from; None: the first batch.
-            together: number of batches that one call of `load` returns.
+            together: number of batches that one call of `load` is for.
+            finish: makes each batch, just before it is returned, so that those ahead may be smaller; default: `load`
+                returns batches.
 
         Raises:
             UserError: `start` is invalid, or was saved with other settings.
         """
-        self._load, self._count, self._settings = load, count, dict(settings)
+        self._load, self._finish, self._count, self._settings = load, finish, count, dict(settings)
         self._position = 0 if start is None else _position_in(start, self._settings)
         self._pool = ThreadPoolExecutor(len(own_cores()), "levelproof-reader")
         self._together, self._next = together, self._position  # the position that is loaded next
-        self._loaded: deque[T] = deque()
-        self._ahead: deque[Future[Sequence[T]]] = deque()
+        self._loaded: deque[Any] = deque()
+        self._ahead: deque[Future[Sequence[Any]]] = deque()
         self._most = max(prefetch + 1, together)  # the batch that is returned next, and those ahead of it
         self._end = weakref.finalize(self, self._pool.shutdown, wait=False, cancel_futures=True)
 
@@ -65,7 +68,7 @@ class Batches(Iterator[T], Generic[T]):
                 self.close()
                 raise
         self._position += 1
-        return self._loaded.popleft()
+        return self._finish(self._loaded.popleft())
 
     def state(self) -> dict[str, Any]:
         """Return the position as JSON values: `batches(..., start=state)` resumes with the batch that would be next."""
@@ -87,13 +90,14 @@ class Batches(Iterator[T], Generic[T]):
 
 
 def batches_of(
-    load: Callable[[range], Sequence[T]],
+    load: Callable[[range], Sequence[Any]],
     order: EpochOrder,
     settings: dict[str, Any],
     epochs: int | None,
     prefetch: int | None,
     start: Any,
     together: int = 1,
+    finish: Callable[[Any], T] = lambda loaded: loaded,
 ) -> Batches[T]:
     """Iterate over the batches of epochs in an order.
 
@@ -105,8 +109,8 @@ def batches_of(
     settings |= {"batch_size": order.batch_size, "seed": order.seed, "process_count": order.process_count}
     count = None if epochs is None else epochs * order.batches
     if prefetch is None:
-        return Batches(load, count, settings, 2 * together * len(own_cores()), start, together)
-    return Batches(load, count, settings, max(prefetch, 0), start, max(1, min(together, (prefetch + 1) // 2)))
+        return Batches(load, count, settings, 2 * together * len(own_cores()), start, together, finish)
+    return Batches(load, count, settings, max(prefetch, 0), start, max(1, min(together, (prefetch + 1) // 2)), finish)
 
 
 def _position_in(start: Any, settings: Mapping[str, Any]) -> int:

@@ -17,14 +17,14 @@ from levelproof.levelgen.level import Level, size_of
 from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.environment import EnvState
 from levelproof.levelgen.task.observe.kinds import ObservationType
-from levelproof.physics.types import Size
-from levelproof.pipeline.dataset.batch import Batch, expand_fields, require_steps, state_in, whole_numbers
+from levelproof.physics.types import Size, State
+from levelproof.pipeline.dataset.batch import Batch, expand_fields, require_steps, state_in, timed_out, whole_numbers
 from levelproof.pipeline.dataset.batches import Batches, batches_of
 from levelproof.pipeline.dataset.differing import KEEP, Differing
 from levelproof.pipeline.dataset.episodes import EpisodeBatch, gather_episodes
-from levelproof.pipeline.dataset.observations import parse_observation
+from levelproof.pipeline.dataset.observations import observe, parse_observation
 from levelproof.pipeline.dataset.order import EpochOrder
-from levelproof.pipeline.dataset.records import gather_windows
+from levelproof.pipeline.dataset.records import GOAL, repeat
 from levelproof.pipeline.dataset.renamed import renamed
 from levelproof.pipeline.dataset.sources import TrajectorySource
 from levelproof.pipeline.dataset.subsets import check_share, in_subset
@@ -37,6 +37,7 @@ from levelproof.pipeline.store.named import open_shard
 from levelproof.pipeline.words import many
 
 EPISODES_AT_ONCE = 1024  # read together for batches of episodes, so that many lanes are busy
+AT_ONCE = 512  # the same for batches of records of seeds
 OPEN_SHARDS = 256  # shards whose indices are cached
 ALWAYS_FIELDS = ("record/action", "record/reward", "record/done", "record/goal")
 
@@ -158,18 +159,20 @@ class Dataset:
         indices = np.atleast_1d(whole_numbers(indices, "indices"))
         starts = np.broadcast_to(whole_numbers(first, "first steps"), indices.shape)
         require_steps(starts)
-        needed = list(dict.fromkeys([*chosen, *ALWAYS_FIELDS, *expand_fields("level", self.size)]))
-        gather = lambda rows: gather_windows(
-            self.split, rows, windows, starts, needed, kind, self.rules.max_timesteps, self._shard, self._differing.note
-        )
-        arrays, shown = self._trajectories.gathered(indices, gather)
+        if self._repeats(windows, kind):
+            episodes = self.episodes(indices, [*chosen, GOAL], observation)
+            return repeat(episodes, starts, windows, chosen, self.rules.max_timesteps)
+        needed = [*chosen, *ALWAYS_FIELDS, *expand_fields(["level", *(["record/state"] if kind else [])], self.size)]
+        whole = self._arrays(indices, needed)
+        late = timed_out(whole["record/done"], whole["record/goal"], self.rules.max_timesteps)
+        arrays = windows.cut(whole | {"record/truncated": late}, starts)
         level, level_id = tree_of(Level, arrays, "level/"), self._trajectories.level_ids(indices)
         effective = action_mask(jax.tree.map(lambda x: np.moveaxis(x, 0, -1), level)).T[:, None]
         return Batch(
             level_id=level_id,
             first=starts,
             mask=windows.mask(starts) & self._differing.kept(level_id)[:, None],
-            observation=shown,
+            observation=observe(kind, level, tree_of(State, arrays, "record/state/")) if kind else None,
             action=arrays["record/action"],
             action_mask=np.broadcast_to(effective, arrays["record/action"].shape),
             reward=arrays["record/reward"],
@@ -210,7 +213,7 @@ class Dataset:
             epochs: number of epochs; None: endless.
             process_index: index of this host.
             process_count: number of hosts that share the batches; all pass the same arguments but `process_index`.
-            prefetch: number of batches to read ahead; None: two per core.
+            prefetch: number of batches to read ahead; None: two per core, of seeds two loads of some 500 trajectories.
             start: a result of `Batches.state`, from any host, to resume from; None: the first batch.
 
         Raises:
@@ -218,17 +221,26 @@ class Dataset:
             Failure: from the iterator, if the data is damaged.
         """
         windows, indices, fields = Windows.of(length), self._subset(subset), expand_fields(fields, self.size)
-        parse_observation(observation)
         order = EpochOrder(len(indices) * windows.per_record, batch_size, seed, process_index, process_count)
+        settings, kind = self._settings(subset=subset, length=length), parse_observation(observation)
 
-        def load(position: int) -> Batch:
-            items, new = order.items(position)
+        def read(positions: range) -> list[Batch]:
+            items, new = order.items(positions)
             which, first = windows.locate(items)
             batch = self.read(indices[which], length, first, fields, observation)
-            return replace(batch, mask=batch.mask & new[:, None])
+            return [replace(batch, mask=batch.mask & new[:, None])]
 
-        settings = self._settings(subset=subset, length=length)
-        return batches_of(lambda positions: [*map(load, positions)], order, settings, epochs, prefetch, start)
+        def play(positions: range) -> list[tuple[EpisodeBatch, np.ndarray]]:
+            items, new = order.items(positions)
+            which, first = windows.locate(items)
+            made = self.episodes(indices[which], [*fields, GOAL], observation)
+            parts = replace(made, mask=made.mask & new[made.episode]).parts(batch_size)
+            return [*zip(parts, first.reshape(-1, batch_size), strict=True)]
+
+        if not self._repeats(windows, kind):
+            return batches_of(read, order, settings, epochs, prefetch, start)
+        finish = lambda part: repeat(part[0], part[1], windows, fields, self.rules.max_timesteps)
+        return batches_of(play, order, settings, epochs, prefetch, start, max(1, AT_ONCE // batch_size), finish)
 
     def episodes(
         self,
@@ -356,6 +368,13 @@ class Dataset:
     def _settings(self, **chosen: Any) -> dict[str, Any]:
         """Return what decides the batches of an iterator, besides their order."""
         return {"trajectories": self.fingerprint, "validation": self._validation, **chosen}
+
+    def _repeats(self, windows: Windows, kind: ObservationType | None) -> bool:
+        """Whether records are made of first episodes: those of seeds are, unless windows are observed as images.
+
+        Images of whole episodes would take more memory than those of short windows.
+        """
+        return self._trajectories.of_seeds and (windows.whole or kind != ObservationType.PIXELS)
 
     def _subset(self, subset: str | None) -> Int[np.ndarray, " index"]:
         if subset is None:

@@ -22,7 +22,7 @@ from levelproof.pipeline.dataset.observations import observe_rows
 from levelproof.pipeline.read.rows import Open, parts_of
 from levelproof.pipeline.store.contents import table_for
 from levelproof.pipeline.store.fields import tree_of
-from levelproof.pipeline.store.seed.shard import SeedEpisodes, play_seeds, seeds_alike
+from levelproof.pipeline.store.seed.shard import SeedEpisodes, SeedShard, play_seeds
 from levelproof.pipeline.store.shard import Part, Report, read_together, report_unlike
 
 STATE, ACTION, REWARD, DONE = "record/state", "record/action", "record/reward", "record/done"
@@ -101,7 +101,8 @@ def gather_episodes(
     size = parts[0][0].size
     levels = [field.name for field in table_for(size) if field.name.startswith("level/")]
     names = list(dict.fromkeys([*levels, *fields, ACTION, REWARD, DONE]))
-    if seeds := seeds_alike(parts):
+    if all(isinstance(shard, SeedShard) and shard.encoding == parts[0][0].encoding for shard, _ in parts):
+        seeds: Any = parts
         made = play_seeds(seeds, places, names, kind)
         report_unlike(parts, places, np.where(made.wrong, 0, -1), report)
     else:

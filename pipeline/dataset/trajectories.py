@@ -37,6 +37,7 @@ class TrajectoryRows:
         table: their manifest rows, in the order of level ids.
         rules: task rules that they were played by.
         simulates: whether reading simulates, because records are not stored whole.
+        of_seeds: whether they are those of seed files.
     """
 
     def __init__(self, split: Path, where: str | None, columns: Sequence[str], fingerprint: str | None = None) -> None:
@@ -44,8 +45,8 @@ class TrajectoryRows:
 
         With the `fingerprint` of the trajectories that another process opened, use the table that it shared, if any.
         """
-        self._split, self._lock, self._is_seed = split, Lock(), is_seed(split)
-        hashed = [] if self._is_seed else ["content_hash"]  # of seeds on demand: it takes their levels
+        self._split, self._lock, self.of_seeds = split, Lock(), is_seed(split)
+        hashed = [] if self.of_seeds else ["content_hash"]  # of seeds on demand: it takes their levels
         columns = [*hashed, *ALWAYS_COLUMNS, *columns, *columns_in(where)]
         self._kind = f"trajectories with {columns}"
         found = None if fingerprint is None else self._found(self._kind, fingerprint)
@@ -106,7 +107,7 @@ class TrajectoryRows:
         return table if name is None else share_table(name, table)
 
     def _name(self, kind: str, fingerprint: str) -> str | None:
-        return name_of_table(f"{kind} {fingerprint}", seed_files(self._split)) if self._is_seed else None
+        return name_of_table(f"{kind} {fingerprint}", seed_files(self._split)) if self.of_seeds else None
 
     def level_ids(self, indices: Int[np.ndarray, " batch"]) -> Int[np.ndarray, " batch"]:
         """Return the ids of levels."""

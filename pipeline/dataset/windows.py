@@ -1,9 +1,8 @@
 """Cutting of records into consecutive windows, the last one padded."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
@@ -45,16 +44,10 @@ class Windows(NamedTuple):
         """Return which steps of windows starting at `first` lie within the record; the others are padding."""
         return first[:, None] + np.arange(self.length) < RECORD_STEPS
 
-    def cut(self, arrays: Mapping[str, Any], first: Int[np.ndarray, " item"]) -> dict[str, Any]:
-        """Cut windows from records, padded with the last step.
-
-        Args:
-            arrays: by name; those of `record/` are pytrees of arrays [item, time, ...], and others stay as they are.
-            first: step at which each window starts.
-        """
+    def cut(self, arrays: Mapping[str, np.ndarray], first: Int[np.ndarray, " item"]) -> dict[str, np.ndarray]:
+        """Cut windows from records [item, time, ...], padded with the last step; keep fields without a time axis."""
         if self.whole and not first.any():
             return dict(arrays)
         steps = np.minimum(first[:, None] + np.arange(self.length), RECORD_STEPS - 1)
         rows = np.arange(len(first))[:, None]
-        part = lambda x: jax.tree.map(lambda each: each[rows, steps], x)
-        return {name: part(x) if name.startswith("record/") else x for name, x in arrays.items()}
+        return {name: x[rows, steps] if name.startswith("record/") else x for name, x in arrays.items()}

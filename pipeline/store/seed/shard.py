@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Bool, Int
 
-from levelproof.experts.witness.episode import play_episodes, repeat_episodes
+from levelproof.experts.witness.episode import play_episodes, repeated_rows
 from levelproof.levelgen.level import Level, name_of
 from levelproof.levelgen.task.observe.kinds import ObservationType
 from levelproof.pipeline.errors import Failure
@@ -115,18 +115,12 @@ class SeedShard(Shard):
             level = _levels(seeds, _order(places))
             return Restored(_of_levels(level, names), np.full(len(level), -1))
         made = play_seeds(seeds, places, names)
-        arrays = made.level | repeat_episodes(made.rows, made.steps)
+        rows = repeated_rows(made.steps)
+        arrays = made.level | {name: x.take(rows, 0) for name, x in made.rows.items()}
         return Restored({name: arrays[name] for name in names}, np.where(made.wrong, 0, -1))
 
 
 SeedPart = tuple[SeedShard, Sequence[int]]
-
-
-def seeds_alike(parts: Sequence[Part]) -> Sequence[SeedPart] | None:
-    """Return these parts if `play_seeds` can play them together: all are seed files, of one set of rules."""
-    seeds = [(shard, rows) for shard, rows in parts if isinstance(shard, SeedShard)]
-    alike = len(seeds) == len(parts) and len({shard.encoding for shard, _ in seeds}) == 1
-    return seeds if alike else None
 
 
 def stored_levels(source: Path, level_ids: np.ndarray) -> Level:

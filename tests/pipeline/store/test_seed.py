@@ -17,8 +17,9 @@ from rich.console import Console
 import levelproof
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.labels import Label
-from levelproof.experts.witness.episode import repeat_episodes
+from levelproof.experts.witness.episode import repeated_rows
 from levelproof.levelgen.task.actions import CHOICES
+from levelproof.pipeline.dataset.batch import Batch
 from levelproof.pipeline.errors import Exit, UserError
 from levelproof.pipeline.exchange.seed import export_seed
 from levelproof.pipeline.jobs.grow import _job, grow
@@ -149,7 +150,7 @@ def test_seed_records_repeat_their_first_episode(seed: Path) -> None:
     steps = data.manifest["steps_to_goal"].to_numpy()
     for name, values in batch.fields.items():
         first = values[np.arange(RECORD_STEPS) < steps[:, None]]
-        assert_same({name: repeat_episodes(first, steps)}, {name: values})
+        assert_same({name: first[repeated_rows(steps)]}, {name: values})
 
 
 @pytest.mark.parametrize(
@@ -168,10 +169,30 @@ def test_seeds_read_as_the_split_that_they_grow_into(
 ) -> None:
     fields = ["level", "record/state", "record/timestep"]
     ours, theirs = (levelproof.open(path).read([4, 0, 4], length, first, fields, kind) for path in (seed, grown))
+    assert_same_batch(ours, theirs)
+
+
+def assert_same_batch(ours: Batch, theirs: Batch) -> None:
     for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(ours), jax.tree.leaves(theirs), strict=True):
         assert isinstance(a, np.ndarray)
         assert (a.dtype, a.shape) == (b.dtype, b.shape), path
         np.testing.assert_array_equal(a, b, str(path))
+
+
+@pytest.mark.parametrize(("length", "prefetch"), [(None, None), (100, 3)])
+def test_batches_of_seeds_are_those_of_the_split_that_they_grow_into(
+    seed: Path, grown: Path, length: int | None, prefetch: int | None
+) -> None:
+    """Two epochs, whose last batches are padded; from the third batch on."""
+    chosen: dict[str, Any] = {"seed": 2, "epochs": 2, "length": length, "fields": ["record/timestep", "level"]}
+    theirs = [*levelproof.open(grown).batches(3, **chosen)]
+    before = levelproof.open(seed).batches(3, **chosen, prefetch=prefetch)
+    first = [next(before), next(before)]
+    rest = levelproof.open(seed).batches(3, **chosen, prefetch=prefetch, start=before.state())
+    ours = [*first, *rest]
+    assert not ours[-1].mask.all(), "padding"
+    for a, b in zip(ours, theirs, strict=True):
+        assert_same_batch(a, b)
 
 
 def test_seed_manifest_has_the_columns_of_its_split(split: Path, seed: Path) -> None:
