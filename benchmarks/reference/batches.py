@@ -7,8 +7,10 @@ that the queue stays empty, the rate is sustainable, and memory stays small.
 
 import argparse
 import json
+import os
 import pickle
 import time
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -59,9 +61,18 @@ def main() -> None:
     manager = TrajectoryDatasetManager(args.folder, args.batch, seed=0)
     manager.load_next_batch()
     first = time.perf_counter() - start
-    print(json.dumps({"first": first} | rates(manager.load_next_batch, jax.tree.leaves, args.batch, args.seconds)))
+    last = deque(maxlen=KEPT)
+
+    def next_batch() -> Any:
+        last.append(manager.load_next_batch())
+        return last[-1]
+
+    print(json.dumps({"first": first} | rates(next_batch, jax.tree.leaves, args.batch, args.seconds)), flush=True)
     if args.keep:
-        args.keep.write_bytes(pickle.dumps([manager.load_next_batch().env_state for _ in range(KEPT)]))
+        with args.keep.open("wb") as file:
+            for batch in last:
+                pickle.dump(batch.env_state, file, protocol=5)
+    os._exit(0)  # a usual end would wait for the reading threads, which fill the memory with batches
 
 
 if __name__ == "__main__":

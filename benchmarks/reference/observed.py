@@ -22,7 +22,10 @@ def main() -> None:
     from kinetix.environment import EnvParams, static_env_params_from_size
     from kinetix.render import make_render_symbolic
 
-    states = pickle.loads(args.kept.read_bytes())
+    states = []
+    with args.kept.open("rb") as file:
+        while file.peek(1):
+            states.append(pickle.load(file))
     render = jax.jit(jax.vmap(jax.vmap(make_render_symbolic(EnvParams(), static_env_params_from_size(args.size)))))
     shape = jax.block_until_ready(render(states[0])).shape
     start, count = time.process_time(), 0
