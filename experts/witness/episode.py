@@ -34,7 +34,7 @@ from levelproof.physics.types import Manifold
 FEW_LANES, MANY_LANES = 16, 128
 FEW, MANY = 64, 512  # episodes: up to FEW have a small program; from MANY on there are MANY_LANES
 AT_ONCE = 2 * MANY  # most episodes that are played together
-STEPS = 128  # maximum env steps per lane in one call of a program
+STEPS = 256  # maximum env steps per lane in one call of a program
 STEPS_WITH_PIXELS = 8  # an image has 188 kB
 
 
@@ -140,13 +140,14 @@ def _play_together(
     lanes = MANY_LANES if len(levels) > MANY else FEW_LANES
     begin, lane = (x[moves.episode] for x in _places(moves.step[moves.last] + 1, lanes))
     time, length = begin + moves.step, STEPS_WITH_PIXELS if observation == ObservationType.PIXELS else STEPS
-    playing = _waiting(levels, lanes, fields)
+    playing, idle = _waiting(levels, lanes, fields), len(time)
+    padded = jax.tree.map(lambda x: np.concatenate([x, np.zeros_like(x[:1])]), moves)  # the last row is for idle lanes
     for start in range(0, int(time.max()) + 1, length):
         where = np.flatnonzero((time >= start) & (time < start + length))
         at, mine = time[where] - start, lane[where]
-        turn = jax.tree.map(lambda x: np.zeros((length, lanes, *x.shape[1:]), x.dtype), moves)
-        for to, source in zip(turn, moves, strict=True):
-            to[at, mine] = source[where]
+        rows = np.full((length, lanes), idle)
+        rows[at, mine] = where
+        turn = jax.tree.map(lambda x, rows=rows: x.take(rows, 0), padded)
         playing, played = _play_turn(levels, playing, turn, at.max() + 1, rules, fields, observation)
         of_rows = lambda x, place=at * lanes + mine: x.reshape(-1, *x.shape[2:]).take(place, 0)
         yield where, jax.tree.map(of_rows, jax.device_get(played))
