@@ -1,7 +1,7 @@
 """Seeds against splits on a disk: bytes per level, and transitions/s of first episodes read in random batches.
 
 The same trajectories are read several ways: simulated from seeds, decoded from `full` shards that the seeds grew into,
-by the reference's own reader from an export of these, and, as the ceiling, stepped without any reading by
+by the reference's own reader from an export of these, and, for comparison, stepped without any reading by
 `levelproof.Lanes`. Transitions of first episodes count, and none that repeats another.
 """
 

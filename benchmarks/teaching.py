@@ -1,4 +1,4 @@
-"""Which data teaches best: clones of the same levels' witnesses, made by different procedures, and teachers.
+"""Which data teaches best: witnesses of the same levels, made by different procedures, and labels by teachers.
 
 A stopped run resumes, except in a `generate`: every command continues what it left, and the folder keeps finished
 evaluations.
@@ -63,9 +63,9 @@ def run(args: argparse.Namespace) -> Report:
     return Report(
         "Which data teaches best",
         results,
-        [Table(head, rows, "Share of sealed levels labelled solved that a clone solves; 95% intervals over levels")],
+        [Table(head, rows, "Share of sealed levels labelled solved that a policy solves; 95% intervals over levels")],
         [
-            f"All clones learn from the same {len(common):,} levels, those among ids {FIRST:,} to "
+            f"All policies learn from the same {len(common):,} levels, those among ids {FIRST:,} to "
             f"{FIRST + args.levels - 1:,} that every procedure solves, and take {args.updates:,} updates"
             f"{', with ' if args.set else ''}{' '.join(f'`{setting}`' for setting in args.set)}. Random actions solve "
             f"{interval_text(players['random']['once'])} of the {players['random']['levels']:,} sealed levels.",

@@ -9,8 +9,9 @@ import argparse
 import json
 import os
 import pickle
+import sys
 import time
-from collections import deque
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,8 +21,12 @@ import numpy as np
 KEPT, ROUNDS = 4, 3  # batches that are copied, and how often; also those whose states are kept
 
 
-def rates(next_batch: Callable[[], Any], arrays: Callable[[Any], list], batch: int, seconds: float) -> dict[str, float]:
+def rates(
+    next_batch: Callable[[], Any], arrays: Callable[[Any], list], batch: int, seconds: float
+) -> tuple[dict[str, float], list[Any]]:
     """Measure trajectories/s and, as `core_...`, per second of CPU time: as read, and with every array copied.
+
+    Also returns the batches that were copied.
 
     Copies are timed by the CPU time of their own thread, and few: a caller that copies is slower than the readers,
     which then fill the memory with batches that nobody takes.
@@ -36,14 +41,15 @@ def rates(next_batch: Callable[[], Any], arrays: Callable[[Any], list], batch: i
 
     read()  # warms up, and empties the queue
     reading, of_core = read()
-    some = [array for _ in range(KEPT) for array in arrays(next_batch())]
+    kept = [next_batch() for _ in range(KEPT)]
+    some = [array for each in kept for array in arrays(each)]
     before = time.thread_time()
     for array in some * ROUNDS:
         np.ascontiguousarray(array)
     copying = (time.thread_time() - before) / (KEPT * ROUNDS * batch)
     names = ("rate", "core_rate", "copied", "core_copied")
     times = (reading, of_core, reading + copying, of_core + copying)
-    return {name: 1 / taken for name, taken in zip(names, times, strict=True)}
+    return {name: 1 / taken for name, taken in zip(names, times, strict=True)}, kept
 
 
 def main() -> None:
@@ -61,19 +67,20 @@ def main() -> None:
     manager = TrajectoryDatasetManager(args.folder, args.batch, seed=0)
     manager.load_next_batch()
     first = time.perf_counter() - start
-    last = deque(maxlen=KEPT)
-
-    def next_batch() -> Any:
-        last.append(manager.load_next_batch())
-        return last[-1]
-
-    print(json.dumps({"first": first} | rates(next_batch, jax.tree.leaves, args.batch, args.seconds)), flush=True)
+    found, kept = rates(manager.load_next_batch, jax.tree.leaves, args.batch, args.seconds)
+    print(json.dumps({"first": first} | found), flush=True)
     if args.keep:
         with args.keep.open("wb") as file:
-            for batch in last:
+            for batch in kept:
                 pickle.dump(batch.env_state, file, protocol=5)
-    os._exit(0)  # a usual end would wait for the reading threads, which fill the memory with batches
 
 
 if __name__ == "__main__":
-    main()
+    code = 1
+    try:
+        main()
+        code = 0
+    except Exception:
+        traceback.print_exc()
+    sys.stderr.flush()
+    os._exit(code)  # a usual end would wait for the reading threads, which fill the memory with batches

@@ -35,6 +35,7 @@ FEW_LANES, MANY_LANES = 16, 128
 FEW, MANY = 64, 512  # episodes: up to FEW have a small program; from MANY on there are MANY_LANES
 AT_ONCE = 2 * MANY  # most episodes that are played together
 STEPS = 256  # maximum env steps per lane in one call of a program
+STEPS_WITH_STATES = 128  # a state of l has 2 kB, with its contacts 6 kB
 STEPS_WITH_PIXELS = 8  # an image has 188 kB
 
 
@@ -139,7 +140,7 @@ def _play_together(
     """Play episodes; yield some rows and which ones they are, until all are played."""
     lanes = MANY_LANES if len(levels) > MANY else FEW_LANES
     begin, lane = (x[moves.episode] for x in _places(moves.step[moves.last] + 1, lanes))
-    time, length = begin + moves.step, STEPS_WITH_PIXELS if observation == ObservationType.PIXELS else STEPS
+    time, length = begin + moves.step, _turn_length(fields, observation)
     playing, idle = _waiting(levels, lanes, fields), len(time)
     padded = jax.tree.map(lambda x: np.concatenate([x, np.zeros_like(x[:1])]), moves)  # the last row is for idle lanes
     for start in range(0, int(time.max()) + 1, length):
@@ -163,6 +164,13 @@ def _places(
         begin[episode], lane[episode] = free[0]
         heapq.heapreplace(free, (int(begin[episode] + steps[episode]), free[0][1]))
     return begin, lane
+
+
+def _turn_length(fields: frozenset[str], observation: ObservationType | None) -> int:
+    """Return how many env steps per lane one call of a program plays; a call keeps room for that many rows."""
+    if observation == ObservationType.PIXELS:
+        return STEPS_WITH_PIXELS
+    return STEPS_WITH_STATES if any(name.startswith(("state/", "manifold/")) for name in fields) else STEPS
 
 
 @partial(jax.jit, static_argnames=("lanes", "fields"))

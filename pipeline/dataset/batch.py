@@ -28,6 +28,8 @@ T = TypeVar("T")
 class Batch:
     """Trajectories or windows as a pytree of numpy arrays [batch, time, ...]; no batch axis for a single trajectory.
 
+    Copy an array before you write to it: some are read-only.
+
     Step t holds the observation, the action taken from it, and the reward and flags of that action. A record is 256
     steps with automatic reset: the step after one that is `done` is the first of the level's next episode.
 

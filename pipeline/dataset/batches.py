@@ -11,6 +11,7 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.runtime import own_cores
 
 RENAMED = {"batch": "batch_size", "part": "subset"}  # old names in states saved by the previous version
+FINISHED = 2  # batches at most that are finished: the one that is returned next, and the one after it
 T = TypeVar("T")
 
 
@@ -28,19 +29,20 @@ class Batches(Iterator[T], Generic[T]):
         prefetch: int,
         start: Any,
         together: int = 1,
-        finish: Callable[[Any], T] = lambda loaded: loaded,
+        finish: Callable[[Any], T] | None = None,
     ) -> None:
         """Start iterating, and prefetching.
 
         Args:
-            load: returns what makes the batches at consecutive positions; called in threads.
+            load: returns what makes the batches at consecutive positions; called in threads. The last positions may
+                be beyond `count`.
             count: number of batches; None: endless.
             settings: arguments that determine the sequence of batches, as JSON.
             prefetch: number of batches to read ahead.
             start: a result of `state` to resume from; None: the first batch.
             together: number of batches that one call of `load` is for.
-            finish: makes each batch, just before it is returned, so that those ahead may be smaller; default: `load`
-                returns batches.
+            finish: makes each batch, shortly before it is returned, so that those ahead may be smaller; called in a
+                thread; None: `load` returns batches.
 
         Raises:
             UserError: `start` is invalid, or was saved with other settings.
@@ -48,27 +50,44 @@ class Batches(Iterator[T], Generic[T]):
         self._load, self._finish, self._count, self._settings = load, finish, count, dict(settings)
         self._position = 0 if start is None else _position_in(start, self._settings)
         self._pool = ThreadPoolExecutor(len(own_cores()), "levelproof-reader")
+        self._finisher = ThreadPoolExecutor(1, "levelproof-reader")  # of its own: it would wait for loads
         self._together, self._next = together, self._position  # the position that is loaded next
+        self._ahead: deque[tuple[range, Future[Sequence[Any]]]] = deque()
         self._loaded: deque[Any] = deque()
-        self._ahead: deque[Future[Sequence[Any]]] = deque()
+        self._finished: deque[Future[T]] = deque()
         self._most = max(prefetch + 1, together)  # the batch that is returned next, and those ahead of it
-        self._end = weakref.finalize(self, self._pool.shutdown, wait=False, cancel_futures=True)
+        self._end = weakref.finalize(self, _stop, self._pool, self._finisher)
 
     def __next__(self) -> T:
         while self._end.alive and self._has_room() and (some := self._positions()):
-            self._ahead.append(self._pool.submit(self._load, some))
+            self._ahead.append((some, self._pool.submit(self._load, self._padded(some))))
             self._next = some.stop
-        if not self._loaded:
-            if not self._ahead:
-                self.close()
-                raise StopIteration
-            try:
-                self._loaded.extend(self._ahead.popleft().result())
-            except BaseException:
-                self.close()
-                raise
-        self._position += 1
-        return self._finish(self._loaded.popleft())
+        try:
+            while len(self._finished) < FINISHED and self._has_loaded():
+                self._finished.append(self._finishing(self._loaded.popleft()))
+            if self._finished:
+                batch = self._finished.popleft().result()
+                self._position += 1
+                return batch
+        except BaseException:
+            self.close()
+            raise
+        self.close()
+        raise StopIteration
+
+    def _finishing(self, loaded: Any) -> Future[T]:
+        if self._finish is not None:
+            return self._finisher.submit(self._finish, loaded)
+        finished: Future[T] = Future()
+        finished.set_result(loaded)
+        return finished
+
+    def _has_loaded(self) -> bool:
+        """Whether a batch can be finished; waits for it if none is being finished."""
+        if not self._loaded and self._ahead and (not self._finished or self._ahead[0][1].done()):
+            some, loaded = self._ahead.popleft()
+            self._loaded.extend(loaded.result()[: len(some)])
+        return bool(self._loaded)
 
     def state(self) -> dict[str, Any]:
         """Return the position as JSON values: `batches(..., start=state)` resumes with the batch that would be next."""
@@ -76,8 +95,8 @@ class Batches(Iterator[T], Generic[T]):
 
     def close(self) -> None:
         """Stop prefetching and end the iteration."""
-        self._ahead.clear()
-        self._loaded.clear()
+        for waiting in self._ahead, self._loaded, self._finished:
+            waiting.clear()
         self._end()
 
     def _has_room(self) -> bool:
@@ -88,6 +107,16 @@ class Batches(Iterator[T], Generic[T]):
         stop = self._next + self._together
         return range(self._next, stop if self._count is None else min(stop, self._count))
 
+    def _padded(self, some: range) -> range:
+        """Return as many positions as in the loads before, because fewer may need a program that is not compiled."""
+        only_load = self._count is not None and self._count <= self._together
+        return some if only_load else range(some.start, some.start + self._together)
+
+
+def _stop(*pools: ThreadPoolExecutor) -> None:
+    for pool in pools:
+        pool.shutdown(wait=False, cancel_futures=True)
+
 
 def batches_of(
     load: Callable[[range], Sequence[Any]],
@@ -97,7 +126,7 @@ def batches_of(
     prefetch: int | None,
     start: Any,
     together: int = 1,
-    finish: Callable[[Any], T] = lambda loaded: loaded,
+    finish: Callable[[Any], T] | None = None,
 ) -> Batches[T]:
     """Iterate over the batches of epochs in an order.
 

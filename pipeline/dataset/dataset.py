@@ -21,10 +21,10 @@ from levelproof.physics.types import Size, State
 from levelproof.pipeline.dataset.batch import Batch, expand_fields, require_steps, state_in, timed_out, whole_numbers
 from levelproof.pipeline.dataset.batches import Batches, batches_of
 from levelproof.pipeline.dataset.differing import KEEP, Differing
-from levelproof.pipeline.dataset.episodes import EpisodeBatch, gather_episodes
+from levelproof.pipeline.dataset.episodes import GOAL, EpisodeBatch, gather_episodes
 from levelproof.pipeline.dataset.observations import observe, parse_observation
 from levelproof.pipeline.dataset.order import EpochOrder
-from levelproof.pipeline.dataset.records import GOAL, repeat
+from levelproof.pipeline.dataset.records import Records, loaded_together
 from levelproof.pipeline.dataset.renamed import renamed
 from levelproof.pipeline.dataset.sources import TrajectorySource
 from levelproof.pipeline.dataset.subsets import check_share, in_subset
@@ -37,7 +37,6 @@ from levelproof.pipeline.store.named import open_shard
 from levelproof.pipeline.words import many
 
 EPISODES_AT_ONCE = 1024  # read together for batches of episodes, so that many lanes are busy
-AT_ONCE = 512  # the same for batches of records of seeds
 OPEN_SHARDS = 256  # shards whose indices are cached
 ALWAYS_FIELDS = ("record/action", "record/reward", "record/done", "record/goal")
 
@@ -160,8 +159,8 @@ class Dataset:
         starts = np.broadcast_to(whole_numbers(first, "first steps"), indices.shape)
         require_steps(starts)
         if self._repeats(windows, kind):
-            episodes = self.episodes(indices, [*chosen, GOAL], observation)
-            return repeat(episodes, starts, windows, chosen, self.rules.max_timesteps)
+            records = Records(windows, chosen, self.rules.max_timesteps)
+            return records.repeat(self.episodes(indices, [*chosen, GOAL], observation), starts)
         needed = [*chosen, *ALWAYS_FIELDS, *expand_fields(["level", *(["record/state"] if kind else [])], self.size)]
         whole = self._arrays(indices, needed)
         late = timed_out(whole["record/done"], whole["record/goal"], self.rules.max_timesteps)
@@ -213,7 +212,8 @@ class Dataset:
             epochs: number of epochs; None: endless.
             process_index: index of this host.
             process_count: number of hosts that share the batches; all pass the same arguments but `process_index`.
-            prefetch: number of batches to read ahead; None: two per core, of seeds two loads of some 500 trajectories.
+            prefetch: number of batches to read ahead; None: two per core; of seeds two loads per core, each of batches
+                with 512 trajectories or windows (with pixels of one batch).
             start: a result of `Batches.state`, from any host, to resume from; None: the first batch.
 
         Raises:
@@ -230,17 +230,16 @@ class Dataset:
             batch = self.read(indices[which], length, first, fields, observation)
             return [replace(batch, mask=batch.mask & new[:, None])]
 
-        def play(positions: range) -> list[tuple[EpisodeBatch, np.ndarray]]:
+        def play(positions: range) -> list[Any]:
             items, new = order.items(positions)
             which, first = windows.locate(items)
             made = self.episodes(indices[which], [*fields, GOAL], observation)
-            parts = replace(made, mask=made.mask & new[made.episode]).parts(batch_size)
-            return [*zip(parts, first.reshape(-1, batch_size), strict=True)]
+            return records.parts(made, first, new, batch_size)
 
         if not self._repeats(windows, kind):
             return batches_of(read, order, settings, epochs, prefetch, start)
-        finish = lambda part: repeat(part[0], part[1], windows, fields, self.rules.max_timesteps)
-        return batches_of(play, order, settings, epochs, prefetch, start, max(1, AT_ONCE // batch_size), finish)
+        records, together = Records(windows, fields, self.rules.max_timesteps), loaded_together(batch_size, kind)
+        return batches_of(play, order, settings, epochs, prefetch, start, together, records.finish)
 
     def episodes(
         self,

@@ -25,7 +25,7 @@ from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.seed.shard import SeedEpisodes, SeedShard, play_seeds
 from levelproof.pipeline.store.shard import Part, Report, read_together, report_unlike
 
-STATE, ACTION, REWARD, DONE = "record/state", "record/action", "record/reward", "record/done"
+STATE, ACTION, REWARD, DONE, GOAL = (f"record/{name}" for name in ("state", "action", "reward", "done", "goal"))
 
 
 @jax.tree_util.register_dataclass

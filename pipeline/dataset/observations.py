@@ -32,7 +32,8 @@ def parse_observation(name: str | None) -> ObservationType | None:
 def observe(kind: ObservationType, level: Level, states: State) -> Any:
     """Observe levels [batch, ...] in states [batch, time, ...]; return numpy arrays [batch, time, ...]."""
     with COMPILING:
-        return jax.device_get(_observe(kind, level, states))
+        shown = _observe(kind, level, states)
+    return jax.device_get(shown)
 
 
 def observe_rows(kind: ObservationType, level: Level, row_level: Int[np.ndarray, " row"], states: State) -> Any:
@@ -41,7 +42,8 @@ def observe_rows(kind: ObservationType, level: Level, row_level: Int[np.ndarray,
     padded = max(MIN_ROWS, 1 << (count - 1).bit_length())
     row_level, states = jax.tree.map(lambda x: np.resize(x, (padded, *x.shape[1:])), (row_level, states))
     with COMPILING:
-        constant, changing = jax.device_get(_observe_rows(kind, level, row_level, states))
+        made = _observe_rows(kind, level, row_level, states)
+    constant, changing = jax.device_get(made)
     changing = jax.tree.map(lambda x: x[:count], changing)
     return join(kind, jax.eval_shape(_lanes_last, level).size, constant, changing, row_level[:count])
 

@@ -1,53 +1,81 @@
 """Records of seeds: first episodes, repeated up to the steps of a record.
 
-Only first episodes are simulated and observed. The rest are copies, made when a batch is returned.
+Only first episodes are simulated and observed. The rest are copies, made shortly before a batch is returned.
 """
 
-from collections.abc import Iterable
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
-from levelproof.experts.witness.episode import repeated_rows
+from levelproof.experts.witness.episode import MANY, repeated_rows
+from levelproof.levelgen.task.observe.kinds import ObservationType
 from levelproof.pipeline.dataset.batch import Batch, timed_out
-from levelproof.pipeline.dataset.episodes import EpisodeBatch
+from levelproof.pipeline.dataset.episodes import GOAL, EpisodeBatch
 from levelproof.pipeline.dataset.windows import Windows
 
-GOAL = "record/goal"
+USUAL_STEPS = 64  # most first episodes are shorter
 
 
-def repeat(
-    episodes: EpisodeBatch, first: Int[np.ndarray, " batch"], windows: Windows, fields: Iterable[str], limit: int
-) -> Batch:
-    """Return windows of the records that repeat these episodes.
+class Records(NamedTuple):
+    """How windows of records are made of first episodes, whose fields are `fields` and `record/goal`."""
 
-    Args:
-        episodes: the episodes; among their fields are `record/goal` and those of `fields`.
-        first: step of the record at which each window starts.
-        windows: their length.
-        fields: names of the fields to return.
-        limit: env steps after which the task ends an episode.
-    """
-    rows = repeated_rows(episodes.steps)  # of whole records
-    late = timed_out(episodes.done[rows], episodes.fields[GOAL][rows], limit)
-    rows, late = windows.cut({"record/row": rows, "record/late": late}, first).values()
-    take = lambda x: x.take(rows, 0)
-    done = take(episodes.done)
-    return Batch(
-        level_id=episodes.level_id,
-        first=first,
-        mask=windows.mask(first) & take(episodes.mask),
-        observation=jax.tree.map(take, episodes.observation),
-        action=take(episodes.action),
-        action_mask=take(episodes.action_mask),
-        reward=take(episodes.reward),
-        done=done,
-        terminated=done & ~late,
-        truncated=late,
-        goal=take(episodes.fields[GOAL]),
-        fields={
-            name: take(episodes.fields[name]) if name.startswith("record/") else episodes.fields[name]
-            for name in fields
-        },
-    )
+    windows: Windows
+    fields: Sequence[str]  # names of those to return
+    limit: int  # env steps after which the task ends an episode
+
+    def parts(
+        self, episodes: EpisodeBatch, first: Int[np.ndarray, " item"], new: Bool[np.ndarray, " item"], batch_size: int
+    ) -> list["Batch | _Part"]:
+        """Divide episodes into what `finish` makes batches of: whatever is smaller.
+
+        Args:
+            episodes: one for each window.
+            first: step of the record at which each window starts.
+            new: False for windows that pad a batch.
+            batch_size: windows per batch.
+        """
+        some = replace(episodes, mask=episodes.mask & new[episodes.episode]).parts(batch_size)
+        parts = map(_Part, some, first.reshape(-1, batch_size))
+        return [*parts] if self.windows.length > USUAL_STEPS else [*map(self.finish, parts)]
+
+    def finish(self, part: "Batch | _Part") -> Batch:
+        """Make the batch, if this is not one."""
+        return part if isinstance(part, Batch) else self.repeat(*part)
+
+    def repeat(self, episodes: EpisodeBatch, first: Int[np.ndarray, " batch"]) -> Batch:
+        """Return windows of the records that repeat these episodes; `first`: step at which each starts."""
+        rows = repeated_rows(episodes.steps)  # of whole records
+        late = timed_out(episodes.done[rows], episodes.fields[GOAL][rows], self.limit)
+        rows, late = (np.take_along_axis(x, self.windows.steps(first), 1) for x in (rows, late))
+        take = lambda x: x.take(rows, 0)
+        done, fields = take(episodes.done), episodes.fields
+        return Batch(
+            level_id=episodes.level_id,
+            first=first,
+            mask=self.windows.mask(first) & take(episodes.mask),
+            observation=jax.tree.map(take, episodes.observation),
+            action=take(episodes.action),
+            action_mask=take(episodes.action_mask),
+            reward=take(episodes.reward),
+            done=done,
+            terminated=done & ~late,
+            truncated=late,
+            goal=take(fields[GOAL]),
+            fields={name: take(fields[name]) if name.startswith("record/") else fields[name] for name in self.fields},
+        )
+
+
+class _Part(NamedTuple):
+    """What becomes a batch."""
+
+    episodes: EpisodeBatch
+    first: Int[np.ndarray, " batch"]
+
+
+def loaded_together(batch_size: int, kind: ObservationType | None) -> int:
+    """Return how many batches to simulate together: enough to keep many lanes busy, but images take much memory."""
+    return 1 if kind == ObservationType.PIXELS else -(-MANY // batch_size)

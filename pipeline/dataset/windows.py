@@ -44,10 +44,13 @@ class Windows(NamedTuple):
         """Return which steps of windows starting at `first` lie within the record; the others are padding."""
         return first[:, None] + np.arange(self.length) < RECORD_STEPS
 
+    def steps(self, first: Int[np.ndarray, " item"]) -> Int[np.ndarray, "item time"]:
+        """Return the steps of records that windows starting at `first` have; the last step stands for padding."""
+        return np.minimum(first[:, None] + np.arange(self.length), RECORD_STEPS - 1)
+
     def cut(self, arrays: Mapping[str, np.ndarray], first: Int[np.ndarray, " item"]) -> dict[str, np.ndarray]:
         """Cut windows from records [item, time, ...], padded with the last step; keep fields without a time axis."""
         if self.whole and not first.any():
             return dict(arrays)
-        steps = np.minimum(first[:, None] + np.arange(self.length), RECORD_STEPS - 1)
-        rows = np.arange(len(first))[:, None]
+        rows, steps = np.arange(len(first))[:, None], self.steps(first)
         return {name: x[rows, steps] if name.startswith("record/") else x for name, x in arrays.items()}

@@ -122,6 +122,38 @@ def test_batches_loaded_together_stay_within_prefetch() -> None:
     batches.close()
 
 
+def test_batches_load_as_many_as_before_at_the_end_and_return_no_more() -> None:
+    loaded: list[range] = []
+    batches = Batches(lambda positions: loaded.append(positions) or positions, 7, {}, 9, None, together=3)
+    assert [*batches] == [*range(7)]
+    assert loaded == [range(3), range(3, 6), range(6, 9)]
+    few = Batches(lambda positions: loaded.append(positions) or positions, 2, {}, 9, None, together=3)
+    assert [*few] == [0, 1]
+    assert loaded[3:] == [range(2)], "a single load is as small as it can be"
+
+
+def test_batches_finish_no_more_than_the_next_two() -> None:
+    finished: list[int] = []
+    batches = Batches(lambda positions: positions, None, {}, 9, None, 5, lambda x: finished.append(x) or -x)
+    for position in range(4):
+        assert next(batches) == -position
+        wait_until(lambda position=position: len(finished) >= position + 1, 10, finished)
+        time.sleep(0.05)  # time in which too many could be finished
+        assert finished == [*range(len(finished))]
+        assert len(finished) <= position + 2
+    batches.close()
+
+
+def test_batches_that_cannot_be_finished_end_the_iteration() -> None:
+    batches = Batches(lambda positions: positions, None, {}, 3, None, finish=lambda x: 6 // (2 - x))
+    assert [next(batches), next(batches)] == [3, 6]
+    with pytest.raises(ZeroDivisionError):
+        next(batches)
+    assert batches.state()["position"] == 2, "the one that failed was not returned"
+    with pytest.raises(StopIteration):
+        next(batches)
+
+
 @pytest.mark.campaign
 def test_batches_use_bounded_memory(data: Dataset) -> None:
     """A million trajectories are read, by many epochs of a small split."""
