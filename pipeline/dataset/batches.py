@@ -11,7 +11,7 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.runtime import own_cores
 
 RENAMED = {"batch": "batch_size", "part": "subset"}  # old names in states saved by the previous version
-FINISHED = 2  # batches at most that are finished: the one that is returned next, and the one after it
+FINISHED = 2  # most batches that are finished ahead of the caller: the next one, and the one after it
 T = TypeVar("T")
 
 
@@ -50,7 +50,7 @@ class Batches(Iterator[T], Generic[T]):
         self._load, self._finish, self._count, self._settings = load, finish, count, dict(settings)
         self._position = 0 if start is None else _position_in(start, self._settings)
         self._pool = ThreadPoolExecutor(len(own_cores()), "levelproof-reader")
-        self._finisher = ThreadPoolExecutor(1, "levelproof-reader")  # of its own: it would wait for loads
+        self._finisher = ThreadPoolExecutor(1, "levelproof-reader")  # in the other pool it would wait behind loads
         self._together, self._next = together, self._position  # the position that is loaded next
         self._ahead: deque[tuple[range, Future[Sequence[Any]]]] = deque()
         self._loaded: deque[Any] = deque()

@@ -212,8 +212,8 @@ class Dataset:
             epochs: number of epochs; None: endless.
             process_index: index of this host.
             process_count: number of hosts that share the batches; all pass the same arguments but `process_index`.
-            prefetch: number of batches to read ahead; None: two per core; of seeds two loads per core, each of batches
-                with 512 trajectories or windows (with pixels of one batch).
+            prefetch: number of batches to read ahead; None: two per core; from seeds, two loads per core, each of as
+                many batches as hold 512 trajectories or windows (one batch with pixels).
             start: a result of `Batches.state`, from any host, to resume from; None: the first batch.
 
         Raises:

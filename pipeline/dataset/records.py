@@ -20,6 +20,13 @@ from levelproof.pipeline.dataset.windows import Windows
 USUAL_STEPS = 64  # most first episodes are shorter
 
 
+class _Part(NamedTuple):
+    """The episodes that become a batch, and the step of the record at which each window starts."""
+
+    episodes: EpisodeBatch
+    first: Int[np.ndarray, " batch"]
+
+
 class Records(NamedTuple):
     """How windows of records are made of first episodes, whose fields are `fields` and `record/goal`."""
 
@@ -29,8 +36,10 @@ class Records(NamedTuple):
 
     def parts(
         self, episodes: EpisodeBatch, first: Int[np.ndarray, " item"], new: Bool[np.ndarray, " item"], batch_size: int
-    ) -> list["Batch | _Part"]:
-        """Divide episodes into what `finish` makes batches of: whatever is smaller.
+    ) -> list[Batch | _Part]:
+        """Divide episodes into batches: finished ones if windows are short, else what `finish` makes them of later.
+
+        Whichever is smaller waits in memory.
 
         Args:
             episodes: one for each window.
@@ -42,8 +51,8 @@ class Records(NamedTuple):
         parts = map(_Part, some, first.reshape(-1, batch_size))
         return [*parts] if self.windows.length > USUAL_STEPS else [*map(self.finish, parts)]
 
-    def finish(self, part: "Batch | _Part") -> Batch:
-        """Make the batch, if this is not one."""
+    def finish(self, part: Batch | _Part) -> Batch:
+        """Return the batch that this part becomes, or the batch that it is."""
         return part if isinstance(part, Batch) else self.repeat(*part)
 
     def repeat(self, episodes: EpisodeBatch, first: Int[np.ndarray, " batch"]) -> Batch:
@@ -67,13 +76,6 @@ class Records(NamedTuple):
             goal=take(fields[GOAL]),
             fields={name: take(fields[name]) if name.startswith("record/") else fields[name] for name in self.fields},
         )
-
-
-class _Part(NamedTuple):
-    """What becomes a batch."""
-
-    episodes: EpisodeBatch
-    first: Int[np.ndarray, " batch"]
 
 
 def loaded_together(batch_size: int, kind: ObservationType | None) -> int:

@@ -19,7 +19,7 @@ def test_known_sealed_levels_are_what_a_job_makes_of_them(size: str, tmp_path: P
 
     On an AMD EPYC of 2026-11-28, experts of 3, 2 and 6 of these levels of s, m and l solved other numbers of their 16
     attempts than are known: 0.19, 0.09 and 0.38 attempts per level on average. Between different levels it is about 5.
-    How many levels differ says less: an expert that hardly ever succeeds has 0 or 1 by chance.
+    How many levels of l differ says less: most of its experts hardly ever succeed, and have 0 or 1 by chance.
     """
     then = "search.bodies=7 search.patience=393216 search.patience_gap=0"  # the defaults when they were labelled
     job = f"generate size={size} first_level={SEALED.start} levels=32 budget=256k executor=inline {then}"
@@ -30,5 +30,6 @@ def test_known_sealed_levels_are_what_a_job_makes_of_them(size: str, tmp_path: P
     made = np.array(table["label"].to_pylist()) == "solved"
     assert (made != known.solved[:32]).sum() <= 2
     successes, expected = successes_of(table, 16).astype(int), known.successes["256k"][:32].astype(int)
-    assert np.abs(successes - expected).mean() <= 1
+    assert size == "l" or (successes != expected).sum() <= 4
+    assert np.abs(successes - expected).mean() <= 0.5
     assert np.abs(successes - np.roll(expected, 1)).mean() > 2, "other levels would show"
