@@ -1,7 +1,7 @@
 """Batches of trajectories or windows, batch axis first."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -20,6 +20,7 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.store.contents import table_for
 from levelproof.pipeline.store.fields import tree_of
 
+TRUNCATED = "record/truncated"  # `timed_out`, a name among those of fields
 T = TypeVar("T")
 
 
@@ -84,6 +85,33 @@ class Batch:
             return tree_of(kind, self.fields, path)
         except KeyError as error:
             raise UserError(f"The field {error.args[0]} was not read: pass fields=[{path[:-1]!r}].") from None
+
+
+def batch_of(
+    arrays: Mapping[str, np.ndarray],
+    level_id: Int[np.ndarray, " batch"],
+    first: Int[np.ndarray, " batch"],
+    mask: Bool[np.ndarray, "batch time"],
+    observation: Any,
+    live: Bool[np.ndarray, "batch time 6"],
+    fields: Iterable[str],
+) -> Batch:
+    """Make a batch of arrays by field name, TRUNCATED among them; `live` is its `action_mask`."""
+    done, truncated = arrays["record/done"], arrays[TRUNCATED]
+    return Batch(
+        level_id=level_id,
+        first=first,
+        mask=mask,
+        observation=observation,
+        action=arrays["record/action"],
+        action_mask=live,
+        reward=arrays["record/reward"],
+        done=done,
+        terminated=done & ~truncated,
+        truncated=truncated,
+        goal=arrays["record/goal"],
+        fields={name: arrays[name] for name in fields},
+    )
 
 
 def expand_fields(fields: Iterable[str], size: Size) -> list[str]:

@@ -18,7 +18,16 @@ from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.environment import EnvState
 from levelproof.levelgen.task.observe.kinds import ObservationType
 from levelproof.physics.types import Size, State
-from levelproof.pipeline.dataset.batch import Batch, expand_fields, require_steps, state_in, timed_out, whole_numbers
+from levelproof.pipeline.dataset.batch import (
+    TRUNCATED,
+    Batch,
+    batch_of,
+    expand_fields,
+    require_steps,
+    state_in,
+    timed_out,
+    whole_numbers,
+)
 from levelproof.pipeline.dataset.batches import Batches, batches_of
 from levelproof.pipeline.dataset.differing import KEEP, Differing
 from levelproof.pipeline.dataset.episodes import GOAL, EpisodeBatch, gather_episodes
@@ -164,23 +173,13 @@ class Dataset:
         needed = [*chosen, *ALWAYS_FIELDS, *expand_fields(["level", *(["record/state"] if kind else [])], self.size)]
         whole = self._arrays(indices, needed)
         late = timed_out(whole["record/done"], whole["record/goal"], self.rules.max_timesteps)
-        arrays = windows.cut(whole | {"record/truncated": late}, starts)
+        arrays = windows.cut(whole | {TRUNCATED: late}, starts)
         level, level_id = tree_of(Level, arrays, "level/"), self._trajectories.level_ids(indices)
         effective = action_mask(jax.tree.map(lambda x: np.moveaxis(x, 0, -1), level)).T[:, None]
-        return Batch(
-            level_id=level_id,
-            first=starts,
-            mask=windows.mask(starts) & self._differing.kept(level_id)[:, None],
-            observation=observe(kind, level, tree_of(State, arrays, "record/state/")) if kind else None,
-            action=arrays["record/action"],
-            action_mask=np.broadcast_to(effective, arrays["record/action"].shape),
-            reward=arrays["record/reward"],
-            done=arrays["record/done"],
-            terminated=arrays["record/done"] & ~arrays["record/truncated"],
-            truncated=arrays["record/truncated"],
-            goal=arrays["record/goal"],
-            fields={name: arrays[name] for name in chosen},
-        )
+        mask = windows.mask(starts) & self._differing.kept(level_id)[:, None]
+        shown = observe(kind, level, tree_of(State, arrays, "record/state/")) if kind else None
+        live = np.broadcast_to(effective, arrays["record/action"].shape)
+        return batch_of(arrays, level_id, starts, mask, shown, live, chosen)
 
     @renamed(batch="batch_size", part="subset", ahead="prefetch")
     def batches(

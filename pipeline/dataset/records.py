@@ -13,8 +13,8 @@ from jaxtyping import Bool, Int
 
 from levelproof.experts.witness.episode import MANY, repeated_rows
 from levelproof.levelgen.task.observe.kinds import ObservationType
-from levelproof.pipeline.dataset.batch import Batch, timed_out
-from levelproof.pipeline.dataset.episodes import GOAL, EpisodeBatch
+from levelproof.pipeline.dataset.batch import TRUNCATED, Batch, batch_of, timed_out
+from levelproof.pipeline.dataset.episodes import ACTION, DONE, GOAL, REWARD, EpisodeBatch
 from levelproof.pipeline.dataset.windows import Windows
 
 USUAL_STEPS = 64  # most first episodes are shorter
@@ -61,21 +61,11 @@ class Records(NamedTuple):
         late = timed_out(episodes.done[rows], episodes.fields[GOAL][rows], self.limit)
         rows, late = (np.take_along_axis(x, self.windows.steps(first), 1) for x in (rows, late))
         take = lambda x: x.take(rows, 0)
-        done, fields = take(episodes.done), episodes.fields
-        return Batch(
-            level_id=episodes.level_id,
-            first=first,
-            mask=self.windows.mask(first) & take(episodes.mask),
-            observation=jax.tree.map(take, episodes.observation),
-            action=take(episodes.action),
-            action_mask=take(episodes.action_mask),
-            reward=take(episodes.reward),
-            done=done,
-            terminated=done & ~late,
-            truncated=late,
-            goal=take(fields[GOAL]),
-            fields={name: take(fields[name]) if name.startswith("record/") else fields[name] for name in self.fields},
-        )
+        stored = episodes.fields | {ACTION: episodes.action, REWARD: episodes.reward, DONE: episodes.done}
+        arrays = {name: take(x) if name.startswith("record/") else x for name, x in stored.items()} | {TRUNCATED: late}
+        mask, shown = self.windows.mask(first) & take(episodes.mask), jax.tree.map(take, episodes.observation)
+        live = take(episodes.action_mask)
+        return batch_of(arrays, episodes.level_id, first, mask, shown, live, self.fields)
 
 
 def loaded_together(batch_size: int, kind: ObservationType | None) -> int:
