@@ -22,6 +22,7 @@ from benchmarks.report import Report, Table
 from benchmarks.solved.results import share
 from benchmarks.statistics import flips
 from levelproof.experts.labels import Label
+from levelproof.experts.steps import Seconds
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.runtime import CACHE_VARIABLE, cache_folder, own_cores
 
@@ -42,6 +43,9 @@ if hasattr(os, "sched_setaffinity"):
 from levelproof.__main__ import main
 sys.exit(main())
 """
+# stages whose seconds are told apart by label, and stages of all levels together
+BY_LABEL = [(stage, label) for stage in ("search", "training") for label in (Label.SOLVED, Label.UNSOLVED)]
+TOGETHER = {"evaluation": "evaluation", "replay": "replays"}
 SETTLED = 6.0  # s until programs of sources that were just written are kept in the cache folder
 
 
@@ -62,15 +66,21 @@ def run(args: argparse.Namespace) -> Report:
 
 
 def reported(commit: str, jobs: Sequence[str], results: Sequence[Mapping[str, Any]]) -> Report:
-    """Report each job's cost and solved share under both versions, then compare the labels level by level."""
+    """Report each job's cost and solved share under both versions, where the cost goes, and labels level by level."""
     by = {(result["job"], result["version"]): result for result in results}
     cost = ("job", "version", "core-seconds", "undecided levels", "solved (95% interval)", "for each solved level")
+    parts = [*(f"{stage} of {label} levels" for stage, label in BY_LABEL), *TOGETHER.values()]
     paired = ("job", "levels that both call undecided", f"only {commit} solves", "only today's solves", "p")
     return Report(
         title="What a solved level costs",
         results=results,
         tables=[
             Table(cost, [_cost(result, commit) for result in results]),
+            Table(
+                ("job", "version", *parts, "the rest"),
+                [_spent(result, commit) for result in results],
+                "Where the core-seconds of a solved level go",
+            ),
             Table(paired, [_paired(job, by[job, EARLIER], by[job, NOW]) for job in jobs], "Level by level"),
         ],
         notes=[
@@ -78,6 +88,8 @@ def reported(commit: str, jobs: Sequence[str], results: Sequence[Mapping[str, An
             f"other. Core-seconds are CPU time of the command, from its start to its end; the same job with `{SMALL}` "
             "ran before, so nothing was left to compile. Undecided levels are neither trivial nor proved unsolvable. "
             "Commits before 2026-11-25 have sampler 1, which makes the same levels but for the last digits.",
+            "Where they go: by the manifest's `seconds`, which are those of a clock; the rest is starting, sampling, "
+            "writing, empty slots, and reading compiled programs.",
         ],
     )
 
@@ -109,7 +121,8 @@ def checked_out(commit: str) -> Path:
 
 
 def generated(sources: Path, settings: Sequence[str]) -> dict[str, Any]:
-    """Generate levels with the package in `sources`, on one core; return CPU seconds and labels by level id.
+    """Generate levels with the package in `sources`, on one core; return CPU seconds, labels by level id, and
+    seconds of stages by label.
 
     Raises:
         Failure: the command fails.
@@ -129,8 +142,14 @@ def generated(sources: Path, settings: Sequence[str]) -> dict[str, Any]:
             words = " ".join(command[3:])
             raise Failure(f"`levelproof {words}` in {sources} fails with {done.returncode}:\n{done.stderr[-2000:]}")
         manifests = [str(path) for path in Path(out).glob("*/*/manifest")]
-        rows = [ds.dataset(path, format="parquet").to_table(["level_id", "label"]).to_pylist() for path in manifests]
-    return {"seconds": seconds, "labels": {row["level_id"]: row["label"] for each in rows for row in each}}
+        columns = ["level_id", "label", "seconds"]
+        rows = [row for path in manifests for row in ds.dataset(path, format="parquet").to_table(columns).to_pylist()]
+    stages: dict[str, dict[str, float]] = {}
+    for row in rows:
+        spent = stages.setdefault(row["label"], dict.fromkeys(Seconds._fields, 0.0))
+        for stage, took in row["seconds"].items():
+            spent[stage] += took
+    return {"seconds": seconds, "labels": {row["level_id"]: row["label"] for row in rows}, "stages": stages}
 
 
 def _cost(result: Mapping[str, Any], commit: str) -> list[str]:
@@ -141,6 +160,17 @@ def _cost(result: Mapping[str, Any], commit: str) -> list[str]:
     cost = f"{result['seconds'] / solved:.3f}" if solved else "-"
     numbers = f"{result['seconds']:,.0f}", f"{undecided:,}", share(solved, undecided), cost
     return [f"`{result['job']}`", version, *numbers]
+
+
+def _spent(result: Mapping[str, Any], commit: str) -> list[str]:
+    """Return core-seconds of a solved level by stage; they sum up to its cost."""
+    solved = list(result["labels"].values()).count(Label.SOLVED)
+    version = commit if result["version"] == EARLIER else "today's"
+    by_label = lambda label, stage: result["stages"].get(label, {}).get(stage, 0.0)
+    parts = [by_label(label, stage) for stage, label in BY_LABEL]
+    parts += [sum(spent[stage] for spent in result["stages"].values()) for stage in TOGETHER]
+    parts.append(result["seconds"] - sum(parts))
+    return [f"`{result['job']}`", version, *(f"{part / solved:.3f}" if solved else "-" for part in parts)]
 
 
 def _paired(job: str, earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
