@@ -18,6 +18,7 @@ LINE_EVERY = 30.0  # s between plain lines
 LINE_AFTER = 2.0  # s between plain lines that report commits; the last commit is always reported
 STOPPING = "Stopping once decided levels are committed; press Ctrl-C to quit now."
 PACE_OVER = 60.0  # s over which env steps/s and the remaining time are averaged
+PACE_EVERY = 1.0  # s at least between two samples of the pace: of two close ones, the quotient means nothing
 
 
 @dataclass
@@ -100,6 +101,7 @@ class Board:
         self._pace = Progress(get_time=clock, speed_estimate_period=PACE_OVER, disable=True)
         self._steps = self._pace.add_task("env steps", total=None)
         self._levels = self._pace.add_task("levels", total=tally.levels, completed=tally.done)
+        self._paced_at = -PACE_EVERY
         self.watchers: list[Callable[[float, float | None], None]] = []  # get env steps/s and s to go, at each refresh
 
     def shown(self) -> AbstractContextManager[object]:
@@ -108,7 +110,8 @@ class Board:
     def refresh(self, every: float = LINE_EVERY) -> None:
         """Update the bar, or print a line unless one was printed in the last `every` seconds."""
         steps, levels = self._pace.tasks
-        if self.tally.steps != steps.completed:
+        if self.tally.steps != steps.completed and self._pace.get_time() - self._paced_at >= PACE_EVERY:
+            self._paced_at = self._pace.get_time()
             self._pace.update(self._steps, completed=self.tally.steps)
             self._pace.update(self._levels, completed=self.tally.share * self.tally.levels)
         for watcher in self.watchers:

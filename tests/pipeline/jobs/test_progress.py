@@ -89,6 +89,19 @@ def test_board_keeps_its_pace_during_a_pause() -> None:
     assert "100 env steps/s · about 62 s left" in text.getvalue().splitlines()[-1]
 
 
+def test_board_takes_no_pace_from_two_moments() -> None:
+    now, time = tally(), [0.0]
+    board, text = board_at(now, time)
+    for steps, at in (100, 0.0), (9_000, 0.001), (10_100, 2.0):
+        time[0] = at
+        now.running[UNIT] = (steps, steps / 1000, 0)
+        board.refresh(0.0)
+    first, second, third = text.getvalue().splitlines()
+    assert "· 0 env steps/s" in first
+    assert "· 0 env steps/s" in second
+    assert "· 5,000 env steps/s" in third
+
+
 def test_board_prints_few_lines_without_a_terminal() -> None:
     text = io.StringIO()
     board = Board(tally(), Console(file=text))
