@@ -163,8 +163,8 @@ def train(
             rate, pace = (update - first - 1) / max(time.monotonic() - began - aside, 1e-9), ""
             if rate:
                 pace = f" · {rate * config.train.batch:,.0f} samples/s · about {duration((last - update) / rate)} left"
-            show(1, f"{update:,}/{last:,} updates{pace}")
-            if update % config.interval == 0 or update == last:
+            words, keep = f"{update:,}/{last:,} updates{pace}", update % config.interval == 0 or update == last
+            if keep:
                 paused = time.monotonic()
                 numbers = {COURSE.step: update, "bc/samples_per_second": rate * config.train.batch}
                 numbers |= averages("", recent) | validated(state, held, config)
@@ -173,8 +173,9 @@ def train(
                 recent = []
                 metrics.write(numbers)  # before the checkpoint: a run that continues drops lines after it
                 save(state)
-                say(console, f"{line_of(update, last, numbers)}{pace}")
+                words = f"{line_of(update, last, numbers)}{pace}"
                 aside += time.monotonic() - paused
+            show(1, words, keep)
     return state
 
 

@@ -238,10 +238,9 @@ def update_until_done(
             else:
                 pace = (time.monotonic() - began) / (until - first - config.interval)
                 words += f" · about {duration((last - until) * pace)} left"
-            show(until - update, words)
             metrics.write(numbers)  # before the checkpoint: a run that continues drops lines after it
             save(now)
-            say(console, words)
+            show(until - update, words, keep=True)
     return now
 
 

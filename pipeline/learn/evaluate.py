@@ -3,14 +3,12 @@
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
 from levelproof.experts.evaluation import (
@@ -34,6 +32,7 @@ from levelproof.pipeline.learn.solve_rates import Solved, difference, solve_rate
 from levelproof.pipeline.learn.specialists import Specialists, sealed_specialists, specialists_of
 from levelproof.pipeline.read.agents import SUFFIX as AGENT_SUFFIX
 from levelproof.pipeline.read.agents import Agent, agent_in
+from levelproof.pipeline.read.pace import ProgressBar
 from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.words import many
@@ -217,10 +216,11 @@ def _measured(
     With two players in `compared`, `difference` says by how much the first is better than the second.
     """
     solved, steps = dict[str, Solved](), dict[str, Any]()
-    with _shown(console, group.name, len(group.level_ids) * len(entrants)) as follow:
+    what = f"levels of {group.name}, player by player"
+    with ProgressBar(what, len(group.level_ids) * len(entrants), console) as bar:
         for name, (player, params, chance) in entrants.items():
             tries = attempts if chance else 1
-            played = play(player, params, group.levels, group.level_ids, tries, seed, group.rules, follow)
+            played = play(player, params, group.levels, group.level_ids, tries, seed, group.rules, bar.advance)
             solved[name], steps[name] = played
     solved |= dict(experts)
     chosen = {ALL: np.ones(len(group.level_ids), bool), NOT_TRIVIAL: ~solved[NOTHING][:, 0]}
@@ -276,12 +276,3 @@ def _shown_rate(rate: dict[str, Any] | None) -> str:
         return "-"
     low, high = rate["interval"]
     return f"{100 * rate['rate']:.1f}% ({100 * low:.1f}-{100 * high:.1f})"
-
-
-@contextmanager
-def _shown(console: Console, name: str, total: int) -> Iterator[Any]:
-    """Show a bar on a terminal; yield a function that advances it."""
-    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task(f"playing {name}", total=total)
-        yield lambda count: bar.update(task, advance=count)

@@ -3,7 +3,8 @@
 import hashlib
 import json
 import math
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,6 +17,7 @@ from safetensors.numpy import load, save
 
 from levelproof.experts.networks.saved import CONFIG, WEIGHTS, Policy, named, policy_folder, save_policy, unnamed
 from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.jobs.progress import LINE_EVERY, say
 from levelproof.pipeline.store.disk import NotRegular, read_regular
 from levelproof.pipeline.store.files import write
 
@@ -117,9 +119,21 @@ def keep_run(out: Path, policy: Policy, state: Any) -> None:
 
 
 @contextmanager
-def shown(console: Console, first: str, total: int, completed: int) -> Iterator[Any]:
-    """Show a bar on a terminal, with the text `first`; yield a function that advances it and changes its text."""
+def shown(console: Console, first: str, total: int, completed: int) -> Iterator[Callable[..., None]]:
+    """Show a bar on a terminal, with the text `first`, and elsewhere a line every LINE_EVERY seconds.
+
+    Yields a function that advances the bar by a count and changes its text; with `keep` the text also stays as a line.
+    """
     columns = BarColumn(), TaskProgressColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(first, total=total, completed=completed)
-        yield lambda count, text: bar.update(task, advance=count, description=text)
+        line_at = time.monotonic()
+
+        def show(count: int, text: str, keep: bool = False) -> None:
+            nonlocal line_at
+            bar.update(task, advance=count, description=text)
+            if keep or (not console.is_terminal and time.monotonic() - line_at >= LINE_EVERY):
+                line_at = time.monotonic()
+                say(console, text)
+
+        yield show

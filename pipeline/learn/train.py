@@ -192,8 +192,8 @@ def update_until_done(
                 words += f" · {solved:.1%} solved"
             if rate:
                 words += f" · {rate:,.0f} env steps/s · about {duration((last - update) * per_update / rate)} left"
-            show(1, words)
-            if update % interval == 0 or update == last:
+            keep = update % interval == 0 or update == last
+            if keep:
                 paused = time.monotonic()
                 numbers = {COURSE.step: update * per_update, "train/updates": update} | averages(recent)
                 numbers["train/env_steps_per_second"] = rate
@@ -202,8 +202,8 @@ def update_until_done(
                 recent = []
                 metrics.write(numbers)  # before the checkpoint: a run that continues drops lines after it
                 save(learner)
-                say(console, words)
                 aside += time.monotonic() - paused
+            show(1, words, keep)
     return learner
 
 

@@ -1,16 +1,19 @@
-"""The folder of a run: what is never overwritten."""
+"""The folder of a run: what is never overwritten, and what its bar prints."""
 
+import io
 import shutil
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
+from rich.console import Console
 
 import levelproof
 from levelproof.pipeline.errors import Failure, UserError
-from levelproof.pipeline.learn.folder import CHECKPOINT, continued, keep_run
+from levelproof.pipeline.learn.folder import CHECKPOINT, continued, keep_run, shown
 
 STATE = {"step": np.int32(3)}
 
@@ -46,3 +49,13 @@ def test_weights_that_are_not_finite_replace_nothing(tmp_path: Path) -> None:
         keep_run(tmp_path, diverged, STATE)
     for path in before.iterdir():
         assert (tmp_path / path.name).read_bytes() == path.read_bytes()
+
+
+def test_a_file_gets_kept_lines_and_one_every_half_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, text = [0.0], io.StringIO()
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    with shown(Console(file=text), "compiling", 100, 0) as show:
+        for update in range(1, 101):
+            now[0] += 1.0
+            show(1, f"update {update}", keep=update == 40)
+    assert text.getvalue().splitlines() == ["update 30", "update 40", "update 70", "update 100"]
