@@ -1,12 +1,16 @@
 """Learners at equal cost: RL from scratch, a clone of searched levels, and RL from that clone.
 
 Everything that a way needs counts as its core-seconds. A stopped run resumes, except in a search: every command
-continues what it left, training from its checkpoint, and the folder keeps finished evaluations.
+continues what it left, training from its checkpoint, and the folder keeps finished evaluations. A way takes hours, so
+the repository keeps finished ones, and other machines add theirs.
 """
 
 import argparse
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from threading import Lock
@@ -16,17 +20,24 @@ from benchmarks.cloning import SAMPLED, command, kept, lines_of, timed_split
 from benchmarks.learners import ATTEMPTS, RATE, SECONDS, STEPS, add_ways, rates_text, slug
 from benchmarks.plotting import pyplot
 from benchmarks.report import Report, Table
+from benchmarks.teaching import DISTILLING
 from levelproof.pipeline.learn.evaluate import ALL, SOLVED
 from levelproof.pipeline.runtime import own_cores
+from levelproof.pipeline.store.provenance import device
 
+FINISHED = Path(__file__).parent / "results" / "equal"  # a file for each finished run
+POINTS = 100  # of its curve
 FIRST = 50_000  # id of the first level to clone from; the measured ones are sealed
 BETWEEN_SEEDS = 10_000_000  # ids
 LARGE = ("ppo.environments=2048", "ppo.epochs=2")  # fewer, larger steps than the defaults'
 SCRATCH = (*LARGE, "ppo.learning_rate=3e-4", "ppo.entropy_weight=0.005", "network.width=64")
 TUNING = (*LARGE, "ppo.learning_rate=2e-4", "ppo.entropy_weight=0.002", "ppo.critic_updates=5")
 PLOT = "equal.svg"
+UPDATES = "train/updates"
 SETTLED = 5  # updates, after which lines no longer favour short episodes
+SHARES = "of all", "of solved", "best of 8"
 PLAYERS = "random", "sticky random", "its own expert, 256k"
+CLONE = "clone"
 
 
 class Way(NamedTuple):
@@ -36,20 +47,30 @@ class Way(NamedTuple):
     start: str = ""  # policy that training starts from; CLONE: one that is made first
     colour: str = "#777777"
     own_levels: bool = False  # whether to train on solved levels that are searched first: those of the clone, if any
+    teachers: bool = False  # whether `levelproof distill` takes half of the clone's updates
+
+    @property
+    def searches(self) -> bool:
+        """Whether levels are searched first."""
+        return self.own_levels or self.start == CLONE
 
 
-CLONE = "clone"
 SEARCHING = Lock()  # several ways share levels and a clone
 WAYS = {
     "from scratch": Way(SCRATCH, colour="#0072b2"),
     "from scratch, by default": Way(("network.width=64",), colour="#332288"),
     "from scratch, learnability": Way((*SCRATCH, "levels=learnability"), colour="#56b4e9"),
+    "from scratch, replay": Way((*SCRATCH, "levels=replay"), colour="#117733"),
+    "from scratch, evolve": Way((*SCRATCH, "levels=evolve"), colour="#882255"),
     "levels, reinforcement on these levels": Way(SCRATCH, colour="#000000", own_levels=True),
     "levels, clone, reinforcement": Way(TUNING, CLONE, "#d55e00"),
     "levels, clone, learnability": Way((*TUNING, "levels=learnability"), CLONE, "#e69f00"),
     "levels, clone, reinforcement on these levels": Way(TUNING, CLONE, "#cc79a7", own_levels=True),
     "levels, clone, learnability on these levels": Way(
         (*TUNING, "choice=learnability"), CLONE, "#999933", own_levels=True
+    ),
+    "levels, clone, teachers, reinforcement on these levels": Way(
+        TUNING, CLONE, "#661100", own_levels=True, teachers=True
     ),
     "from builtin:s": Way(TUNING, "builtin:s", "#009e73"),
 }
@@ -61,16 +82,17 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--levels", default="8k", help="levels to search for a clone (default: 8k)")
     parser.add_argument("--updates", type=int, default=1500, help="updates of a clone (default: 1500)")
     parser.add_argument("--cloning", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of a clone")
+    parser.add_argument("--finished", type=Path, default=FINISHED, help="where finished runs are kept")
 
 
 def run(args: argparse.Namespace) -> Report:
     runs = [(way, seed) for way in args.ways for seed in range(args.seeds)]
     with ThreadPoolExecutor(len(own_cores())) as threads:
-        results = [*threads.map(lambda one: measured(args, *one), runs)]
+        results = [*threads.map(lambda one: finished(args, *one), runs)]
     players = results[0]["sealed"]
     rows = [list(row) for row in dict.fromkeys(tuple(row) for each in results for row in rows_of(each))]
-    rows += [row_of(name, ("", "", ""), players, name) for name in PLAYERS if name in players[ALL]]
-    head = ("policy", "env steps", "core-seconds before training", "in all", "of all", "of solved", "best of 8")
+    rows += [row_of(name, ("", "", "", "", ""), players, name) for name in PLAYERS if name in players[ALL]]
+    head = ("policy", "seed", "processor", "env steps", "core-seconds before training", "in all", *SHARES)
     return Report(
         "Learners at equal cost",
         results,
@@ -84,7 +106,7 @@ def run(args: argparse.Namespace) -> Report:
             "is not counted. *Of all*: "
             f"{players[ALL]['random']['levels']:,} levels, of which some cannot be solved; *of solved*, and the best "
             f"of 8 attempts at them: the {players[SOLVED]['random']['levels']:,} that are labelled solved.",
-            *(f"{way}: `levelproof train {shown(settings_of(args, way, 0))}`." for way in args.ways),
+            *(f"{way}: `levelproof train {words_of(args, way, 0)}`." for way in args.ways),
             f"![Share of episodes that reach the goal in training, against core-seconds]({PLOT})",
             "The plot has the weights as they act, in random levels never played before, or in the levels that a way "
             "trains on; the table measures the average of the weights, which is what is saved, in sealed levels.",
@@ -93,20 +115,43 @@ def run(args: argparse.Namespace) -> Report:
     )  # fmt: skip
 
 
+def finished(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
+    """Return a run from its file, made here or on another machine; else make it."""
+    about = {
+        "way": way,
+        "size": args.size,
+        "seed": seed,
+        "core_seconds": args.core_seconds,
+        "train": words_of(args, way, seed),
+        "levels": args.levels if WAYS[way].searches else None,
+        "clone": [f"train.updates={args.updates}", *args.cloning] if WAYS[way].start == CLONE else None,
+        "measured": args.measured,
+    }
+    told = hashlib.sha256(json.dumps(about).encode()).hexdigest()[:8]
+    file = args.finished / f"{slug(way)}-{args.size}-{seed}-{told}.json"
+    if not file.exists():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        made = {"device": device(), "date": datetime.now(UTC).isoformat(timespec="seconds")}
+        file.write_text(json.dumps(about | made | measured(args, way, seed), indent=1) + "\n")
+    return json.loads(file.read_text())
+
+
 def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
     """Make one policy, and measure it and its clone on sealed levels."""
     folder = args.folder / f"{slug(way)}-{args.size}-{seed}"
     start, before, clone = WAYS[way].start, 0.0, None
     if start == CLONE:
         with SEARCHING:
-            start, before = cloned(args, seed)
-            clone = kept(args.folder / f"clone-{args.size}-{seed}-{args.measured}.json", start, *measuring(args))
+            start, before = cloned(args, way, seed)
+            clone = kept(start.with_name(f"{start.name}-{args.measured}.json"), start, *measuring(args))
     elif WAYS[way].own_levels:
         with SEARCHING:
             before = searched(args, seed)
     curve = trained(args, folder, way, start, seed, args.core_seconds - before)
     rates = kept(args.folder / f"{folder.name}-{curve[-1][STEPS]}-{args.measured}.json", folder, *measuring(args))
-    return {"way": way, "seed": seed, "before": before, "curve": curve, "sealed": rates, "clone": clone}
+    lines = [*curve[:: -(-len(curve) // POINTS)], curve[-1]]
+    some = [{name: line.get(name) for name in (UPDATES, STEPS, SECONDS, RATE)} for line in lines]
+    return {"before": before, "curve": some, "sealed": rates, "cloned": clone}
 
 
 def measuring(args: argparse.Namespace) -> Sequence[Any]:
@@ -114,12 +159,18 @@ def measuring(args: argparse.Namespace) -> Sequence[Any]:
     return "--size", args.size, "--attempts", ATTEMPTS, "--levels", args.measured
 
 
-def cloned(args: argparse.Namespace, seed: int) -> tuple[Path, float]:
+def cloned(args: argparse.Namespace, way: str, seed: int) -> tuple[Path, float]:
     """Search levels, and clone what solves them; return the policy, and the core-seconds of both."""
-    policy, search = args.folder / f"clone-{args.size}-{args.levels}-{seed}", searched(args, seed)
-    words = "network.width=64", f"train.updates={args.updates}", f"seed={seed}", *args.cloning
-    command("clone", split_of(args, seed), "-o", policy, *words)
-    return policy, search + lines_of(policy)[-1]["bc/core_seconds"]
+    updates = args.updates // 2 if WAYS[way].teachers else args.updates
+    policy, split = args.folder / f"clone-{args.size}-{args.levels}-{updates}-{seed}", split_of(args, seed)
+    spent, words = searched(args, seed), (f"train.updates={updates}", f"seed={seed}")
+    command("clone", split, "-o", policy, "network.width=64", *words, *args.cloning)
+    spent += lines_of(policy)[-1]["bc/core_seconds"]
+    if WAYS[way].teachers:
+        start, policy = policy, policy.with_name(f"distilled-{args.size}-{args.levels}-{updates}-{seed}")
+        command("distill", split, "-o", policy, "where=label = 'solved'", f"start={start}", *words, *DISTILLING)
+        spent += lines_of(policy)[-1]["distill/core_seconds"]
+    return policy, spent
 
 
 def searched(args: argparse.Namespace, seed: int) -> float:
@@ -135,8 +186,9 @@ def settings_of(args: argparse.Namespace, way: str, seed: int) -> Sequence[str]:
     return *levels, "cores=1", *WAYS[way].settings, *args.set
 
 
-def shown(words: Sequence[str]) -> str:
-    """Return words as a shell takes them."""
+def words_of(args: argparse.Namespace, way: str, seed: int) -> str:
+    """Return the settings as a shell takes them, wherever the folder is."""
+    words = [word.replace(f"{args.folder}/", "") for word in settings_of(args, way, seed)]
     return " ".join(f'"{word}"' if " " in word else word for word in words)
 
 
@@ -161,7 +213,7 @@ def trained(
         command("train", *words, f"ppo.env_steps={int(steps)}", "-o", policy)
         curve = lines_of(policy)
         first, last = curve[0], curve[-1]
-        update = last[STEPS] / last["train/updates"]
+        update = last[STEPS] / last[UPDATES]
         # Of a single update, most of the seconds are compiling
         rate = (last[STEPS] - first[STEPS]) / (last[SECONDS] - first[SECONDS]) if len(curve) > 1 else 0.0
         left = limit - last[SECONDS] - first[SECONDS]  # the next command starts anew
@@ -172,10 +224,11 @@ def trained(
 
 def rows_of(each: Mapping[str, Any]) -> list[list[str]]:
     """Return the rows of a policy: of its clone, if it has one, and of itself."""
-    last, rows = each["curve"][-1], []
-    if each["clone"]:
-        rows.append(row_of(each["way"].rpartition(", ")[0], ("0", "", f"{each['before']:,.0f}"), each["clone"]))
-    cost = f"{last[STEPS]:,}", f"{each['before']:,.0f}", f"{each['before'] + last[SECONDS]:,.0f}"
+    last, rows, run = each["curve"][-1], [], (str(each["seed"]), each["device"].removeprefix("cpu: "))
+    if each["cloned"]:
+        cost = *run, "0", "", f"{each['before']:,.0f}"
+        rows.append(row_of(each["way"].rpartition(", ")[0], cost, each["cloned"]))
+    cost = *run, f"{last[STEPS]:,}", f"{each['before']:,.0f}", f"{each['before'] + last[SECONDS]:,.0f}"
     return [*rows, row_of(each["way"], cost, each["sealed"])]
 
 
@@ -188,10 +241,11 @@ def draw(results: Sequence[Mapping[str, Any]], path: Path) -> None:
     plt = pyplot()
     figure, axes = plt.subplots(figsize=(6, 3.5), layout="constrained")
     for each in results:
-        curve = [line for line in each["curve"] if line["train/updates"] > SETTLED]
+        curve = [line for line in each["curve"] if line[UPDATES] > SETTLED]
         points = [(each["before"] + line[SECONDS], 100 * line[RATE]) for line in curve if line.get(RATE)]
         label = each["way"] if each["seed"] == 0 else None
-        axes.plot(*zip(*points, strict=True), color=WAYS[each["way"]].colour, label=label, linewidth=1)
+        x, y = zip(*points, strict=True) if points else ((), ())
+        axes.plot(x, y, color=WAYS[each["way"]].colour, label=label, linewidth=1)
     axes.set(xlim=(0, None), xlabel="core-seconds", ylabel="episodes that reach the goal, %")
     axes.legend(frameon=False, loc="lower right")
     axes.spines[["top", "right"]].set_visible(False)

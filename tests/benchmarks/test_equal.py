@@ -7,6 +7,7 @@ import pytest
 from benchmarks.__main__ import parser
 from benchmarks.equal import SECONDS, run, searched, split_of
 from levelproof import Failure
+from levelproof.pipeline.store.provenance import device
 
 TINY = ("ppo.environments=64", "ppo.horizon=32", "ppo.minibatches=4")
 
@@ -22,9 +23,10 @@ def test_search_of_a_stopped_run_is_refused(tmp_path: Path) -> None:
 def test_ways_end_at_the_same_core_seconds(tmp_path: Path) -> None:
     words = ["equal", "--ways", "from scratch", "levels, clone, reinforcement", "--core-seconds", "200"]
     words += ["--levels", "64", "--updates", "2", "--measured", "8", "--folder", str(tmp_path / "kept")]
-    args = parser("equal").parse_args([*words, "--set", *TINY])
+    args = parser("equal").parse_args([*words, "--finished", str(tmp_path / "finished"), "--set", *TINY])
     report = run(args)
     names = [row[0] for row in report.tables[0].rows]
+    assert {row[2] for row in report.tables[0].rows[:3]} == {device().removeprefix("cpu: ")}
     assert names[:3] == ["from scratch", "levels, clone", "levels, clone, reinforcement"]
     scratch, tuned = report.results
     assert scratch["before"] == 0 < tuned["before"] < 200
@@ -35,3 +37,5 @@ def test_ways_end_at_the_same_core_seconds(tmp_path: Path) -> None:
         draw(tmp_path / name)
         assert (tmp_path / name).read_text().rstrip().endswith("</svg>")
     assert run(args).results == report.results, "finished training and evaluations are kept"
+    (tmp_path / "kept").rename(tmp_path / "gone")
+    assert run(args).results == report.results, "finished runs outlive their policies"
