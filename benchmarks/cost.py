@@ -87,7 +87,8 @@ def reported(commit: str, jobs: Sequence[str], results: Sequence[Mapping[str, An
             f"`levelproof generate executor=inline` on one core, at commit {commit} and at {_head()}, one after the "
             f"other. Core-seconds are CPU time of the command, from its start to its end; the same job with `{SMALL}` "
             "ran before, so nothing was left to compile. Undecided levels are neither trivial nor proved unsolvable. "
-            "Commits before 2026-11-25 have sampler 1, which makes the same levels but for the last digits.",
+            "Commits before 2026-11-25 use sampler 1: the same levels, except for the last digits of their numbers. p: "
+            "exact two-sided McNemar test. [What was tried](../tried/patience.md) says why l costs more than before.",
             "Where they go: by the manifest's `seconds`, which are those of a clock; the rest is starting, sampling, "
             "writing, empty slots, and reading compiled programs.",
         ],

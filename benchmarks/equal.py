@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> Report:
             "is not counted. *Of all*: "
             f"{players[ALL]['random']['levels']:,} levels, of which some cannot be solved; *of solved*, and the best "
             f"of 8 attempts at them: the {players[SOLVED]['random']['levels']:,} that are labelled solved.",
-            *(f"{way}: `levelproof train {words_of(args, way, 0)}`." for way in args.ways),
+            *(f"{way}: `levelproof train {words_of(args, way, 0)}{started(way)}`." for way in args.ways),
             f"![Share of episodes that reach the goal in training, against core-seconds]({PLOT})",
             "The plot has the weights as they act, in random levels never played before, or in the levels that a way "
             "trains on; the table measures the average of the weights, which is what is saved, in sealed levels.",
@@ -190,6 +190,12 @@ def words_of(args: argparse.Namespace, way: str, seed: int) -> str:
     """Return the settings as a shell takes them, wherever the folder is."""
     words = [word.replace(f"{args.folder}/", "") for word in settings_of(args, way, seed)]
     return " ".join(f'"{word}"' if " " in word else word for word in words)
+
+
+def started(way: str) -> str:
+    """Return the setting of the policy to start from, as the page shows it."""
+    start = WAYS[way].start
+    return f" start={'clone/' if start == CLONE else start}" if start else ""
 
 
 def split_of(args: argparse.Namespace, seed: int) -> Path:
