@@ -353,7 +353,7 @@ class Dataset:
 
     @property
     def fingerprint(self) -> str:
-        """Hash of the level ids: equal for equal selections of trajectories."""
+        """Hash of the level ids and of the steps to the goal: equal for equal selections of equal trajectories."""
         return self._trajectories.fingerprint
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -77,8 +77,11 @@ class TrajectoryRows:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Hash of the level ids: equal for equal selections of trajectories."""
-        return hashlib.sha256(self.table["level_id"].to_numpy().tobytes()).hexdigest()[:16]
+        """Hash of the level ids and of the steps to the goal: equal for equal selections of equal trajectories."""
+        digest = hashlib.sha256()
+        for name in ("level_id", "steps_to_goal"):
+            digest.update(self.table[name].fill_null(0).to_numpy().tobytes())
+        return digest.hexdigest()[:16]
 
     @property
     def content_hashes(self) -> list[str]:

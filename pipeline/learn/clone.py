@@ -30,6 +30,7 @@ from levelproof.pipeline.learn.folder import (
     require_finite,
     require_same_run,
     shown,
+    with_stack,
     write_note,
 )
 from levelproof.pipeline.learn.metrics import Metrics
@@ -55,7 +56,7 @@ COURSE = Curves(
     ),
     {GREEN: "training", BLUE: "validation"},
 )
-WITHOUT_EFFECT = "log", "played"  # settings that a continued run may change
+WITHOUT_EFFECT = "log", "interval", "played"  # settings that a continued run may change
 
 
 def clone(splits: Sequence[Path], config: CloneConfig, out: Path, console: Console) -> None:
@@ -73,7 +74,7 @@ def clone(splits: Sequence[Path], config: CloneConfig, out: Path, console: Conso
     with explaining_writes(out), only_clone(made(out)) as require_ours:
         require_same_run(out, note)
         state = continued(out, begin_imitation(np.int32(config.seed), config.network, size, config.train))
-        write_note(out, note)
+        write_note(out, note := with_stack(out, note, tell))
         curves = COURSE if config.played else COURSE._replace(panels=COURSE.panels[:-1])
         metrics, done = Metrics(out, curves, config.log, note, int(state.updates), tell, require_ours), False
 

@@ -49,6 +49,7 @@ from levelproof.pipeline.learn.folder import (
     require_same_run,
     shown,
     weights_digest,
+    with_stack,
     write_note,
 )
 from levelproof.pipeline.learn.kept_experts import experts_of
@@ -136,7 +137,7 @@ def distill(split: Path, config: DistillConfig, out: Path, console: Console) -> 
         )
         now = continued(out, fresh)
         now = now._replace(labels=jax.device_get(now.labels))
-        write_note(out, note)
+        write_note(out, note := with_stack(out, note, tell))
         metrics, done = Metrics(out, COURSE, config.log, note, int(now.imitation.updates), tell, require_ours), False
 
         def save(now: Distillation) -> None:

@@ -20,8 +20,10 @@ from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs.progress import LINE_EVERY, say
 from levelproof.pipeline.store.disk import NotRegular, read_regular
 from levelproof.pipeline.store.files import write
+from levelproof.pipeline.store.provenance import device, versions
 
 CHECKPOINT, RUN = "checkpoint.safetensors", "run.json"
+MADE_BY = "made_by"  # in the note: versions and devices that have trained the run, in turn
 T = TypeVar("T")
 
 
@@ -42,8 +44,20 @@ def require_same_run(out: Path, note: dict[str, Any], free: Sequence[str] = ()) 
     if (before := note_in(out)) is None:
         if (out / CONFIG).exists():
             raise UserError(f"{out} has a policy already: choose another folder with -o.")
-    elif _without(before, free) != _without(note, free):
+    elif _without(_without(before, (MADE_BY,)), free) != _without(note, free):
         raise UserError(f"{out} has a run with other settings or levels: repeat its command, or choose another -o.")
+
+
+def with_stack(out: Path, note: dict[str, Any], tell: Callable[[str], None]) -> dict[str, Any]:
+    """Return the note with the versions and devices that have trained the run in `out`, this machine's last.
+
+    Tells the user if they differ from those before: the same command then need not give the same bytes.
+    """
+    before, now = (note_in(out) or {}).get(MADE_BY, []), versions() | {"device": device()}
+    if before and before[-1] != now:
+        others = ", ".join(f"{name} {value}" for name, value in before[-1].items() if now.get(name) != value)
+        tell(f"This run was begun with {others}, so its policy will differ from that of an uninterrupted run.")
+    return note | {MADE_BY: before if before[-1:] == [now] else [*before, now]}
 
 
 def _without(note: Any, path: Sequence[str]) -> Any:

@@ -36,6 +36,7 @@ from levelproof.pipeline.learn.folder import (
     require_same_run,
     shown,
     weights_digest,
+    with_stack,
     write_note,
 )
 from levelproof.pipeline.learn.metrics import Metrics
@@ -56,7 +57,7 @@ COURSE = Curves(
     {GREEN: "solve rate", BLUE: "entropy"},
 )
 LATER = ("settings", "ppo", "env_steps")  # in the note: where training ends, which a resumed run may move
-WITHOUT_EFFECT = ("log", "cores")  # settings that a resumed run may change; the number of cores is noted separately
+WITHOUT_EFFECT = "log", "interval", "cores"  # settings that a resumed run may change; the cores are noted separately
 
 
 def train(config: TrainConfig, out: Path, console: Console) -> None:
@@ -85,7 +86,7 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
         steps = int(learner.updates) * config.ppo.steps_per_update
         if int(learner.updates) > config.ppo.updates:
             raise UserError(f"{out} has {steps:,} env steps of training already: set a larger ppo.env_steps.")
-        write_note(out, note)
+        write_note(out, note := with_stack(out, note, tell))
         metrics, done = Metrics(out, COURSE, config.log, note, steps, tell, require_ours), False
 
         def save(learner: Learner) -> None:

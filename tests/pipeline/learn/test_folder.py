@@ -13,7 +13,16 @@ from rich.console import Console
 
 import levelproof
 from levelproof.pipeline.errors import Failure, UserError
-from levelproof.pipeline.learn.folder import CHECKPOINT, continued, keep_run, shown
+from levelproof.pipeline.learn.folder import (
+    CHECKPOINT,
+    MADE_BY,
+    continued,
+    keep_run,
+    require_same_run,
+    shown,
+    with_stack,
+    write_note,
+)
 
 STATE = {"step": np.int32(3)}
 
@@ -59,3 +68,17 @@ def test_a_file_gets_kept_lines_and_one_every_half_minute(monkeypatch: pytest.Mo
             now[0] += 1.0
             show(1, f"update {update}", keep=update == 40)
     assert text.getvalue().splitlines() == ["update 30", "update 40", "update 70", "update 100"]
+
+
+def test_run_that_another_stack_began_continues_and_says_so(tmp_path: Path) -> None:
+    told = list[str]()
+    write_note(tmp_path, here := with_stack(tmp_path, {"seed": 0}, told.append))
+    assert with_stack(tmp_path, {"seed": 0}, told.append) == here
+    assert not told
+    (stack,) = here[MADE_BY]
+    write_note(tmp_path, {"seed": 0, MADE_BY: [stack | {"jax": "0.9"}]})
+    require_same_run(tmp_path, {"seed": 0})
+    assert with_stack(tmp_path, {"seed": 0}, told.append)[MADE_BY] == [stack | {"jax": "0.9"}, stack]
+    assert told == ["This run was begun with jax 0.9, so its policy will differ from that of an uninterrupted run."]
+    with pytest.raises(UserError, match="has a run with other settings or levels"):
+        require_same_run(tmp_path, {"seed": 1})

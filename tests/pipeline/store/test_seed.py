@@ -130,6 +130,14 @@ def test_seed_file_opens_with_the_rows_and_first_episodes_of_its_split(split: Pa
     ours, theirs = levelproof.open(seed), levelproof.open(split)
     assert (ours.rules, ours.size) == (theirs.rules, theirs.size)
     assert ours.fingerprint == theirs.fingerprint
+    rows = ours._trajectories
+    before = rows.fingerprint
+    del rows.fingerprint
+    rows.table = rows.table.set_column(
+        rows.table.column_names.index("steps_to_goal"), "steps_to_goal", pc.add(rows.table["steps_to_goal"], 1)
+    )
+    assert rows.fingerprint != before, "other witnesses of the same levels are other trajectories"
+    ours = levelproof.open(seed)
     indices, steps = np.arange(len(ours)), ours.manifest["steps_to_goal"].to_numpy()
     a, b = (data.read(indices, fields=["level", "record"]) for data in (ours, theirs))
     for name, values in b.fields.items():
