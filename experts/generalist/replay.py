@@ -86,10 +86,7 @@ def learned(config: ReplayConfig, buffer: ReplayBuffer, ended: EndedEpisodes) ->
     age = jnp.where(episodes > 0, 0, buffer.age + 1)
 
     new = done & ~known & (ended.level_index < FIRST_EXTRA)
-    regret = jnp.where(new, ended.gained - ended.expected, -jnp.inf)
-    by_level = jnp.lexsort((-regret, ended.level_index))  # of several episodes of a new level the best enters
-    again = jnp.diff(ended.level_index[by_level], prepend=EMPTY) == 0
-    regret = regret.at[by_level].set(jnp.where(again, -jnp.inf, regret[by_level]))
+    levels, gained, regret = _by_level(ended, new)
     count = min(capacity, len(new))
     regret, which = jax.lax.top_k(regret, count)
     kept = jnp.where(waiting(buffer) & (episodes == 0), jnp.inf, score)
@@ -98,13 +95,23 @@ def learned(config: ReplayConfig, buffer: ReplayBuffer, ended: EndedEpisodes) ->
     slot = jnp.where(enters, weakest, capacity)
     put = lambda x, values: x.at[slot].set(values, mode="drop")
     after = ReplayBuffer(
-        put(buffer.level_index, ended.level_index[which]),
+        put(buffer.level_index, levels[which]),
         put(score, regret),
-        put(best, ended.gained[which]),
+        put(best, gained[which]),
         put(age, 0),
         buffer.cumulative,
     )
     return with_weights(config, after)
+
+
+def _by_level(ended: EndedEpisodes, some: Bool[Array, " episode"]) -> tuple[Array, Array, Array]:
+    """Return the levels of some episodes, the highest return of each, and its score; the score of padding is -inf."""
+    padded = jnp.where(some, ended.level_index, EMPTY)
+    levels, place = jnp.unique(padded, return_inverse=True, size=len(some), fill_value=EMPTY)
+    gained = jnp.full(len(some), -jnp.inf).at[place].max(jnp.where(some, ended.gained, -jnp.inf))
+    sums = lambda x: jnp.zeros(len(some)).at[place].add(jnp.where(some, x, 0.0))
+    episodes = sums(1.0)
+    return levels, gained, jnp.where(episodes > 0, gained - sums(ended.expected) / jnp.maximum(episodes, 1), -jnp.inf)
 
 
 def with_weights(config: ReplayConfig, buffer: ReplayBuffer) -> ReplayBuffer:
