@@ -23,7 +23,7 @@ class TrainConfig:
     choice: Literal["uniform", "learnability", "replay"] = "uniform"  # how levels of a split or of files are chosen
     starts: int = 1  # start states per level of a split: its initial state, and others evenly spaced along its witness
     start: str = ""  # folder of a policy to continue training, with its network; empty: from scratch
-    cores: int = 0  # CPU cores; 0: as many as divide the lanes evenly; a resumed run keeps its number
+    cores: int = 0  # CPU cores; 0: as many as divide lanes and minibatches evenly; a resumed run keeps its number
     interval: int = 25  # updates between lines of metrics, each with a checkpoint
     seed: int = 0  # seed of the initial weights and of all random draws
     log: Literal["none", "tensorboard", "wandb"] = "none"  # logger of scalars, besides metrics.jsonl

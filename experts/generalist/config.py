@@ -80,7 +80,7 @@ class PPOConfig:
 class CurriculumConfig:
     """Settings of the curriculum by learnability (hashable: pass as a static argument)."""
 
-    share: float = 0.5  # share of episodes in levels that the measurement kept; the others draw from all
+    share: float = 0.5  # share of episodes in levels that the measurement kept, however few; the others draw from all
     every: int = 100  # updates between measurements
     candidates: int = 1024  # levels that are measured, drawn from all
     measured_steps: int = 1024  # env steps of a measurement in each level; episodes have up to 256
