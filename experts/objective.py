@@ -62,6 +62,13 @@ def normalised(advantage: Float[Array, "..."]) -> Float[Array, "..."]:
     return (advantage - advantage.mean()) / (advantage.std() + ADVANTAGE_EPSILON)
 
 
+def normalised_over(axis_name: str, advantage: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Do as `normalised` for a minibatch that is distributed over a mapped axis, in equal shares."""
+    mean = lambda x: jax.lax.pmean(x.mean(), axis_name)
+    centred = advantage - mean(advantage)
+    return centred / (jnp.sqrt(mean(jnp.square(centred))) + ADVANTAGE_EPSILON)
+
+
 def terms(
     logits: Float[Array, "logit sample"],
     value: Float[Array, " sample"],

@@ -23,7 +23,7 @@ from levelproof.experts.generalist.curricula import Curriculum, EndedEpisodes
 from levelproof.experts.generalist.rollout import Ended, Experience, Playing, begin, rollout
 from levelproof.experts.networks.layers import LOGITS
 from levelproof.experts.networks.over_levels import NetworkConfig, logits_and_summary
-from levelproof.experts.objective import advantages, normalised, terms
+from levelproof.experts.objective import advantages, normalised_over, terms
 from levelproof.experts.optimise import clipped_adam, running_average
 from levelproof.experts.policy import divergence
 from levelproof.levelgen.identity.keys import key_of_seed
@@ -234,7 +234,7 @@ def _epochs(
             return jax.tree.map(jnp.add, total, (gradient, means)), None
 
         zeros = jax.tree.map(jnp.zeros_like, (params, (0.0,) * TERMS))
-        gain = jnp.where(batch.counts, normalised(batch.advantage), 0.0)
+        gain = jnp.where(batch.counts, normalised_over(CORES, batch.advantage), 0.0)
         total, _ = jax.lax.scan(add, zeros, (batch, gain))
         gradient, means = jax.lax.pmean(jax.tree.map(lambda x: x / len(index), total), CORES)
         if starts:

@@ -1,6 +1,7 @@
 """Parts of training one policy over many levels: advantages, the penalty's decay, and which levels come next."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ from levelproof.experts.generalist.curricula import fresh
 from levelproof.experts.generalist.learnability import learnability
 from levelproof.experts.generalist.rollout import Experience, table_of
 from levelproof.experts.generalist.train import _advantages, _kl_weight, _open_ended
+from levelproof.experts.objective import normalised, normalised_over
 from levelproof.experts.optimise import running_average
 from levelproof.experts.policy import divergence, log_probability
 from levelproof.levelgen.level import ACTIONS
@@ -41,6 +43,12 @@ def test_truncated_episode_bootstraps_and_terminated_one_does_not() -> None:
     assert _open_ended(experience([False, True, True], [False, False, True]))[:, 0].tolist() == [False, True, False]
     assert _open_ended(experience([False, True, False], [False, True, False]))[:, 0].tolist() == [False, False, True]
     np.testing.assert_allclose(last, [1 + 0.9 * 20 - 10 + 0.72 * (2 + 0.9 * 30 - 20), 2 + 0.9 * 30 - 20, 0], rtol=1e-6)
+
+
+def test_shares_of_a_minibatch_are_normalised_together() -> None:
+    advantage = jax.random.normal(jax.random.key(0), (4, 8)) * jnp.arange(4)[:, None]
+    parts = jax.vmap(partial(normalised_over, "core"), axis_name="core")(advantage)
+    np.testing.assert_allclose(parts, normalised(advantage), rtol=1e-5, atol=1e-6)
 
 
 def test_kl_penalty_waits_for_the_critic_then_falls_to_zero() -> None:
