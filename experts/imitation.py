@@ -16,7 +16,7 @@ from levelproof.experts.optimise import running_average
 from levelproof.experts.policy import log_probability, most_probable
 from levelproof.levelgen.identity.keys import key_of_seed
 from levelproof.levelgen.level import Level
-from levelproof.levelgen.task.actions import effective_mask
+from levelproof.levelgen.task.actions import action_mask
 from levelproof.physics.bounds import require
 from levelproof.physics.buffers import zeros_of
 from levelproof.physics.types import Size, State
@@ -114,7 +114,7 @@ def _loss(params: VariableDict, transitions: Transitions, network: NetworkConfig
     lanes, size, action = len(transitions.motion), transitions.level.size, jnp.asarray(transitions.action).T
     state = from_motion(transitions.motion, size)
     logits = policy_logits(params, network, replace(transitions.level, state=state), state)
-    live = jnp.broadcast_to(effective_mask(transitions.level), (len(action), lanes))
+    live = jnp.broadcast_to(action_mask(transitions.level), (len(action), lanes))
     count = jnp.maximum(live.sum(0), 1)
     loss = -(log_probability(logits, action, live) / count).mean()
     right = ((most_probable(logits) == action) & live).sum(0) / count

@@ -15,7 +15,6 @@ from jaxtyping import Array, Bool, Int
 
 from levelproof.levelgen.level import ACTIONS, Level, Role
 from levelproof.levelgen.programs import jit_sooner
-from levelproof.levelgen.task.actions import obeying_motors, working_thrusters
 from levelproof.levelgen.task.rules import TaskParams, TaskState, advance, has_nan, has_roles, reset
 from levelproof.physics.manifold import may_touch
 from levelproof.physics.pairs import pairs_of
@@ -91,7 +90,9 @@ def driven(level: Level) -> Bool[Array, "body lane"]:
     model, body = level.model, jnp.arange(level.size.bodies)[:, None]
     one_hot = lambda index: (index[:, None] == body) & model.active  # [joint or thruster, body, lane]
     a, b = one_hot(model.joint_a), one_hot(model.joint_b)
-    obeys, pushes = obeying_motors(level) & a.any(1) & b.any(1), working_thrusters(level)
+    holds = model.joint_active & a.any(1) & b.any(1)
+    obeys = holds & ~model.joint_fixed & model.motor_on & ~level.motor_auto & (model.motor_power != 0)
+    pushes = model.thruster_active & (model.thruster_power != 0)
     acts = ((a | b) & obeys[:, None]).any(0) | (one_hot(model.thruster_body) & pushes[:, None]).any(0)
     return acts & ~immovable(model)
 

@@ -14,7 +14,7 @@ from levelproof.experts.policy import log_probability, sample
 from levelproof.levelgen.level import ACTIONS, Level
 from levelproof.levelgen.sampling.sampler import Sampler, sampler
 from levelproof.levelgen.task import environment
-from levelproof.levelgen.task.actions import effective_mask
+from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.environment import EnvParams
 from levelproof.levelgen.task.fresh import renewed
 from levelproof.levelgen.task.lanes import Lanes, LaneState, LevelTable, Table
@@ -110,7 +110,7 @@ def rollout(
         world = now.state.now.state
         observation = seen(network, replace(now.played.level, state=world), world)
         logits, value = logits_and_value(params, network, size, observation)
-        live = effective_mask(now.played.level)
+        live = action_mask(now.played.level)
         action = jnp.where(live, sample(logits, jax.random.uniform(of_action, (ACTIONS, count))), 0)
         log_before = log_probability(logits, action, live)
         coming = draw(of_level, count)

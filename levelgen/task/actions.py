@@ -66,35 +66,9 @@ def action_mask(level: Level) -> Bool[Array, "6 lane"]:
     As in the reference, a joint makes its entry live even if its motor is off or runs by itself.
     """
     model = level.model
-    return _entries_of(level, model.joint_active & ~model.joint_fixed, model.thruster_active)
-
-
-def effective_mask(level: Level) -> Bool[Array, "6 lane"]:
-    """Find the live entries of an action that change something: of `action_mask`, those that an actuator obeys.
-
-    Learners use it: an entry without effect would add noise to the probability of every action.
-    """
-    return _entries_of(level, obeying_motors(level), working_thrusters(level))
-
-
-def obeying_motors(level: Level) -> Bool[Array, "joint lane"]:
-    """Find joints whose motor does what an entry says."""
-    model = level.model
-    runs = model.motor_on & ~level.motor_auto & (model.motor_power != 0)
-    return model.joint_active & ~model.joint_fixed & runs
-
-
-def working_thrusters(level: Level) -> Bool[Array, "thruster lane"]:
-    """Find thrusters that can push."""
-    return level.model.thruster_active & (level.model.thruster_power != 0)
-
-
-def _entries_of(
-    level: Level, joints: Bool[Array, "joint lane"], thrusters: Bool[Array, "thruster lane"]
-) -> Bool[Array, "6 lane"]:
-    """Find the entries that these joints and thrusters are bound to."""
-    entries = [(joints & (level.motor_binding == k)).any(0) for k in range(MOTOR_BINDINGS)]
-    entries += [(thrusters & (level.thruster_binding == k)).any(0) for k in range(THRUSTER_BINDINGS)]
-    assert len(entries) == ACTIONS
-    stack: Any = np.stack if isinstance(joints, np.ndarray) else jnp.stack  # numpy for readers without JAX
-    return stack(entries)
+    free = model.joint_active & ~model.joint_fixed
+    live = [(free & (level.motor_binding == k)).any(0) for k in range(MOTOR_BINDINGS)]
+    live += [(model.thruster_active & (level.thruster_binding == k)).any(0) for k in range(THRUSTER_BINDINGS)]
+    assert len(live) == ACTIONS
+    stack: Any = np.stack if isinstance(free, np.ndarray) else jnp.stack  # numpy for readers without JAX
+    return stack(live)

@@ -9,8 +9,7 @@ import pytest
 
 from levelproof.levelgen.level import ACTIONS, MOTOR_BINDINGS, SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
-from levelproof.levelgen.task.actions import CHOICES, action_mask, controls, effective_mask
-from levelproof.physics.step import step
+from levelproof.levelgen.task.actions import CHOICES, action_mask, controls
 from levelproof.physics.types import Model
 
 
@@ -84,29 +83,3 @@ def test_mask_counts_motors_that_are_off_or_automatic(level: Level) -> None:
     """The reference's mask counts them, too, although such an entry has no effect."""
     off = with_model(level, motor_on=jnp.zeros((2, 1), bool))
     np.testing.assert_array_equal(action_mask(off), action_mask(level))
-
-
-def test_effective_mask_leaves_out_what_no_actuator_obeys(level: Level) -> None:
-    level = with_model(level, motor_power=jnp.ones((2, 1)), thruster_power=jnp.ones((2, 1)))
-    np.testing.assert_array_equal(effective_mask(level), action_mask(level))
-    none, some = jnp.zeros((2, 1), bool), [True, False, False, False, False, True]
-    automatic = dataclasses.replace(level, motor_auto=jnp.array([[True], [False]]))
-    np.testing.assert_array_equal(effective_mask(automatic)[:, 0], some)
-    np.testing.assert_array_equal(effective_mask(with_model(level, motor_on=none))[:MOTOR_BINDINGS], False)
-    np.testing.assert_array_equal(effective_mask(with_model(level, motor_power=0.0 * none))[:MOTOR_BINDINGS], False)
-    np.testing.assert_array_equal(effective_mask(with_model(level, thruster_power=0.0 * none))[MOTOR_BINDINGS:], False)
-
-
-@pytest.mark.parametrize("size", SIZES)
-def test_other_entries_change_no_bit(size: str) -> None:
-    """Played for half a second with random actions, and with the entries outside of the mask at 0."""
-    levels = sample_levels(jnp.arange(256), SIZES[size])
-    live, rng = np.asarray(effective_mask(levels)), np.random.default_rng(0)
-    assert (live < np.asarray(action_mask(levels))).any(), "some motors are off or automatic"
-    both = [levels.state, levels.state]
-    for _ in range(30):
-        action = rng.integers(0, np.array(CHOICES)[:, None], live.shape)
-        actions = action, np.where(live, action, 0)
-        driven = [controls(levels, jnp.asarray(each, jnp.int32)) for each in actions]
-        both = [step(levels.model, state, *each)[0] for state, each in zip(both, driven, strict=True)]
-    jax.tree.map(np.testing.assert_array_equal, *both)
