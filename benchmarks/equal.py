@@ -195,7 +195,8 @@ def words_of(args: argparse.Namespace, way: str, seed: int) -> str:
 def started(way: str) -> str:
     """Return the setting of the policy to start from, as the page shows it."""
     start = WAYS[way].start
-    return f" start={'clone/' if start == CLONE else start}" if start else ""
+    made = "distilled/" if WAYS[way].teachers else "clone/"
+    return f" start={made if start == CLONE else start}" if start else ""
 
 
 def split_of(args: argparse.Namespace, seed: int) -> Path:
