@@ -8,6 +8,7 @@ the repository keeps finished ones, and other machines add theirs.
 import argparse
 import hashlib
 import json
+import re
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
@@ -21,6 +22,7 @@ from benchmarks.learners import ATTEMPTS, RATE, SECONDS, STEPS, add_ways, rates_
 from benchmarks.plotting import pyplot
 from benchmarks.report import Report, Table
 from benchmarks.teaching import DISTILLING
+from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.learn.evaluate import ALL, SOLVED
 from levelproof.pipeline.runtime import own_cores
 from levelproof.pipeline.store.provenance import device
@@ -83,12 +85,19 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--updates", type=int, default=1500, help="updates of a clone (default: 1500)")
     parser.add_argument("--cloning", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of a clone")
     parser.add_argument("--finished", type=Path, default=FINISHED, help="where finished runs are kept")
+    parser.add_argument("--only-finished", action="store_true", help="show finished runs, and make no other")
 
 
 def run(args: argparse.Namespace) -> Report:
     runs = [(way, seed) for way in args.ways for seed in range(args.seeds)]
-    with ThreadPoolExecutor(len(own_cores())) as threads:
-        results = [*threads.map(lambda one: finished(args, *one), runs)]
+    if args.only_finished:
+        files = [file for one in runs for file in sorted(args.finished.glob(f"{stem_of(args, *one)[0]}-*.json"))]
+    else:
+        with ThreadPoolExecutor(len(own_cores())) as threads:
+            files = [*threads.map(lambda one: finished(args, *one), runs)]
+    if not files:
+        raise UserError(f"--only-finished: {args.finished} has none of these runs; without it they are made.")
+    results = [json.loads(file.read_text()) for file in files]
     players = results[0]["sealed"]
     rows = [list(row) for row in dict.fromkeys(tuple(row) for each in results for row in rows_of(each))]
     rows += [row_of(name, ("", "", "", "", ""), players, name) for name in PLAYERS if name in players[ALL]]
@@ -103,9 +112,11 @@ def run(args: argparse.Namespace) -> Report:
             f"second seed from {FIRST + BETWEEN_SEEDS:,}), the clone "
             f"({', '.join((f'{args.updates:,} updates', *(f'`{each}`' for each in args.cloning)))}), and "
             "reinforcement learning for the rest, on random levels unless a way says otherwise; what builtin:s took "
-            "is not counted. *Of all*: "
+            "is not counted. Compare rows of one processor: another takes more or fewer env steps in as many "
+            "core-seconds. *Of all*: "
             f"{players[ALL]['random']['levels']:,} levels, of which some cannot be solved; *of solved*, and the best "
             f"of 8 attempts at them: the {players[SOLVED]['random']['levels']:,} that are labelled solved.",
+            *dict.fromkeys(each["remark"] for each in results if "remark" in each),
             *(f"{way}: `levelproof train {words_of(args, way, 0)}{started(way)}`." for way in args.ways),
             f"![Share of episodes that reach the goal in training, against core-seconds]({PLOT})",
             "The plot has the weights as they act, in random levels never played before, or in the levels that a way "
@@ -115,8 +126,8 @@ def run(args: argparse.Namespace) -> Report:
     )  # fmt: skip
 
 
-def finished(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
-    """Return a run from its file, made here or on another machine; else make it."""
+def stem_of(args: argparse.Namespace, way: str, seed: int) -> tuple[str, dict[str, Any]]:
+    """Return how the name of a finished run's file begins, and what it is a run of."""
     about = {
         "way": way,
         "size": args.size,
@@ -128,12 +139,18 @@ def finished(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
         "measured": args.measured,
     }
     told = hashlib.sha256(json.dumps(about).encode()).hexdigest()[:8]
-    file = args.finished / f"{slug(way)}-{args.size}-{seed}-{told}.json"
+    return f"{slug(way)}-{args.size}-{seed}-{told}", about
+
+
+def finished(args: argparse.Namespace, way: str, seed: int) -> Path:
+    """Return the file of a run on a processor like this, which is made if there is none: another has its own speed."""
+    stem, about = stem_of(args, way, seed)
+    file = args.finished / f"{stem}-{re.sub('[^A-Za-z0-9]+', '-', device()).strip('-')}.json"
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
         made = {"device": device(), "date": datetime.now(UTC).isoformat(timespec="seconds")}
         file.write_text(json.dumps(about | made | measured(args, way, seed), indent=1) + "\n")
-    return json.loads(file.read_text())
+    return file
 
 
 def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:

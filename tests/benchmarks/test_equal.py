@@ -6,9 +6,13 @@ import pytest
 
 from benchmarks.__main__ import parser
 from benchmarks.equal import SECONDS, run, searched, split_of
-from levelproof import Failure
+from levelproof import Failure, UserError
 from levelproof.pipeline.store.provenance import device
 
+KEPT = (
+    *("equal", "--ways", "from scratch", "--core-seconds", "3600", "--seeds", "2", "--levels", "40k"),
+    *("--updates", "7000", "--cloning", "mirror=true", "pool=60000"),
+)
 TINY = ("ppo.environments=64", "ppo.horizon=32", "ppo.minibatches=4")
 
 
@@ -17,6 +21,15 @@ def test_search_of_a_stopped_run_is_refused(tmp_path: Path) -> None:
     split_of(args, 0).mkdir(parents=True)
     with pytest.raises(Failure, match="remove it, so that its search counts as a whole"):
         searched(args, 0)
+
+
+def test_page_is_made_of_finished_runs_of_any_machine(tmp_path: Path) -> None:
+    args = parser("equal").parse_args([*KEPT, "--only-finished"])
+    rows = run(args).tables[0].rows
+    assert ["from scratch", "0", "Intel(R) Xeon(R) Processor", "25,952,256"] in [row[:4] for row in rows]
+    args.finished = tmp_path
+    with pytest.raises(UserError, match="has none of these runs"):
+        run(args)
 
 
 @pytest.mark.campaign
