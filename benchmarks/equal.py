@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> Report:
     if not files:
         raise UserError(f"--only-finished: {args.finished} has none of these runs; without it they are made.")
     results = [json.loads(file.read_text()) for file in files]
-    players = results[0]["sealed"]
+    players, dates = results[0]["sealed"], sorted(each["date"][:10] for each in results)
     rows = [list(row) for row in dict.fromkeys(tuple(row) for each in results for row in rows_of(each))]
     rows += [row_of(name, ("", "", "", "", ""), players, name) for name in PLAYERS if name in players[ALL]]
     head = ("policy", "seed", "processor", "env steps", "core-seconds before training", "in all", *SHARES)
@@ -123,6 +123,7 @@ def run(args: argparse.Namespace) -> Report:
             "trains on; the table measures the average of the weights, which is what is saved, in sealed levels.",
         ],
         plots={PLOT: partial(draw, results)},
+        made=f"{dates[0]} to {dates[-1]}, on the processors in the table",
     )  # fmt: skip
 
 
