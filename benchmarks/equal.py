@@ -123,7 +123,7 @@ def run(args: argparse.Namespace) -> Report:
             "trains on; the table measures the average of the weights, which is what is saved, in sealed levels.",
         ],
         plots={PLOT: partial(draw, results)},
-        made=f"{dates[0]} to {dates[-1]}, on the processors in the table",
+        made=f"{' to '.join(dict.fromkeys((dates[0], dates[-1])))}, on the processors in the table",
     )  # fmt: skip
 
 
