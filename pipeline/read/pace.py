@@ -30,7 +30,8 @@ class ProgressBar:
         """Add `count` finished items."""
         self._bar.advance(self._task, count)
         (task,) = self._bar.tasks
-        text = f"{task.completed:,.0f}/{task.total:,.0f} {self._what} · {task.speed or 0:,.0f}/s"
+        pace = f" · {task.speed:,.0f}/s" if task.speed else ""  # unknown after a pause
+        text = f"{task.completed:,.0f}/{task.total:,.0f} {self._what}{pace}"
         self._bar.update(self._task, description=text)
         if self._quiet and self._console and time.monotonic() - self._line_at >= LINE_EVERY:
             self._line_at = time.monotonic()
