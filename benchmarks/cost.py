@@ -122,8 +122,10 @@ def checked_out(commit: str) -> Path:
 
 
 def generated(sources: Path, settings: Sequence[str]) -> dict[str, Any]:
-    """Generate levels with the package in `sources`, on one core; return CPU seconds, labels by level id, and
-    seconds of stages by label.
+    """Generate levels with the package in `sources`, on one core.
+
+    Returns:
+        CPU seconds, labels by level id, and seconds of each stage by label.
 
     Raises:
         Failure: the command fails.
@@ -157,21 +159,24 @@ def _cost(result: Mapping[str, Any], commit: str) -> list[str]:
     labels = list(result["labels"].values())
     solved = labels.count(Label.SOLVED)
     undecided = solved + labels.count(Label.UNSOLVED)
-    version = commit if result["version"] == EARLIER else "today's"
     cost = f"{result['seconds'] / solved:.3f}" if solved else "-"
     numbers = f"{result['seconds']:,.0f}", f"{undecided:,}", share(solved, undecided), cost
-    return [f"`{result['job']}`", version, *numbers]
+    return [*_of(result, commit), *numbers]
 
 
 def _spent(result: Mapping[str, Any], commit: str) -> list[str]:
     """Return core-seconds of a solved level by stage; they sum up to its cost."""
     solved = list(result["labels"].values()).count(Label.SOLVED)
-    version = commit if result["version"] == EARLIER else "today's"
     by_label = lambda label, stage: result["stages"].get(label, {}).get(stage, 0.0)
     parts = [by_label(label, stage) for stage, label in BY_LABEL]
     parts += [sum(spent[stage] for spent in result["stages"].values()) for stage in TOGETHER]
     parts.append(result["seconds"] - sum(parts))
-    return [f"`{result['job']}`", version, *(f"{part / solved:.3f}" if solved else "-" for part in parts)]
+    return [*_of(result, commit), *(f"{part / solved:.3f}" if solved else "-" for part in parts)]
+
+
+def _of(result: Mapping[str, Any], commit: str) -> list[str]:
+    """Return the cells that say which job and version a row is of."""
+    return [f"`{result['job']}`", commit if result["version"] == EARLIER else "today's"]
 
 
 def _paired(job: str, earlier: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

@@ -265,12 +265,15 @@ def draw(results: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Plot the solve rate of training against all core-seconds, those before training included."""
     plt = pyplot()
     figure, axes = plt.subplots(figsize=(6, 3.5), layout="constrained")
+    labelled = set[str]()  # ways in the legend
     for each in results:
         curve = [line for line in each["curve"] if line[UPDATES] > SETTLED]
         points = [(each["before"] + line[SECONDS], 100 * line[RATE]) for line in curve if line.get(RATE)]
-        label = each["way"] if each["seed"] == 0 else None
-        x, y = zip(*points, strict=True) if points else ((), ())
-        axes.plot(x, y, color=WAYS[each["way"]].colour, label=label, linewidth=1)
+        if not points:
+            continue
+        label = None if each["way"] in labelled else each["way"]
+        labelled.add(each["way"])
+        axes.plot(*zip(*points, strict=True), color=WAYS[each["way"]].colour, label=label, linewidth=1)
     axes.set(xlim=(0, None), xlabel="core-seconds", ylabel="episodes that reach the goal, %")
     axes.legend(frameon=False, loc="lower right")
     axes.spines[["top", "right"]].set_visible(False)
