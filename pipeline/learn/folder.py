@@ -52,8 +52,13 @@ def with_stack(out: Path, note: dict[str, Any], tell: Callable[[str], None]) -> 
     """Return the note with the versions and devices that have trained the run in `out`, this machine's last.
 
     Tells the user if they differ from those before: the same command then need not give the same bytes.
+
+    Raises:
+        Failure: the note is damaged.
     """
     before, now = (note_in(out) or {}).get(MADE_BY, []), versions() | {"device": device()}
+    if not (isinstance(before, list) and all(isinstance(each, dict) for each in before)):
+        raise Failure(f"{out / RUN} is damaged ({MADE_BY}): choose another folder with -o.")
     if before and before[-1] != now:
         others = ", ".join(f"{name} {value}" for name, value in before[-1].items() if now.get(name) != value)
         tell(f"This run was begun with {others}, so its policy will differ from that of an uninterrupted run.")
