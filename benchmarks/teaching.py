@@ -1,4 +1,6 @@
-"""Which data teaches best: witnesses of the same levels, made by different procedures, and labels by teachers.
+"""Which data teaches best: witnesses by different procedures, labels by teachers, and what experts show with noise.
+
+Kinds of data are compared twice: on the same levels, and at the same cost of the data.
 
 A stopped run resumes, except in a `generate`: every command continues what it left, and the folder keeps finished
 evaluations.
@@ -8,7 +10,7 @@ import argparse
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,99 +26,162 @@ DATA = {  # name: settings of `levelproof generate`
     "default": ("budget=64k",),
     "label": ("budget=64k", "procedure=label"),
     "label, polished": ("budget=64k", "procedure=label", "search.polish=65536"),
-    "masters": ("budget=256k", "procedure=masters"),
+    "masters": ("budget=256k", "procedure=masters", "keep_experts=true"),
 }
-TEACHERS = "label, teachers"  # witnesses of "label" for half of the updates, then labels of the learner's own states
-KINDS = (*DATA, TEACHERS)
 DISTILLING = ("train.learning_rate=5e-4",)
-TEACHING = (
-    f"*{TEACHERS}*: a clone of half as many updates, then as many of `levelproof distill {' '.join(DISTILLING)}`, on "
-    "the same levels: teachers label states that the learner itself gets into."
-)
+AS_CLONES = ("train.learning_rate=1e-3", "train.warmup=500", "train.average=0.999")
+SHOWING = ("states=0", "episodes=64", "demonstrations=512", *AS_CLONES)
+
+
+class Distilled(NamedTuple):
+    """A policy that `levelproof distill` trains."""
+
+    data: str  # kind of DATA
+    cloned: bool  # whether a clone takes half of the updates before
+    settings: tuple[str, ...]
+    about: str
+
+
+DISTILLED = {
+    "label, teachers": Distilled("label", True, DISTILLING, "teachers label states that the learner itself gets into"),
+    "masters, rollouts": Distilled(
+        "masters",
+        False,
+        (*SHOWING, "teachers.sticky=0", "teachers.perturbed=0"),
+        "half of the transitions are of episodes that the levels' experts play anew",
+    ),
+    "masters, noisy rollouts": Distilled(
+        "masters",
+        False,
+        SHOWING,
+        "these episodes have noise: half of them sticky actions, half perturbed velocities at the start",
+    ),
+}
+KINDS = (*DATA, *DISTILLED)
 COLUMNS = {"sampled": (SAMPLED, "once"), "greedy": (GREEDY, "once"), "best of 8": (SAMPLED, "best")}
 
 
 def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", nargs="+", choices=KINDS, default=KINDS, help="default: all")
     parser.add_argument("--levels", type=int, default=1640, help="ids to make each kind of data of (default: 1640)")
+    parser.add_argument("--cost", type=float, help="core-seconds of each kind's data in a further comparison")
     parser.add_argument("--seeds", type=int, default=2, help="clones of each kind (default: 2)")
-    parser.add_argument("--updates", type=int, default=1500, help="updates of each clone (default: 1500)")
+    parser.add_argument("--updates", type=int, default=1000, help="updates of each policy (default: 1000)")
+    parser.add_argument("--cost-updates", type=int, default=2500, help="the same with --cost (default: 2500)")
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of every clone")
     parser.add_argument("--measured", type=int, default=2048, help="sealed levels to measure on (default: 2048)")
     parser.add_argument("--folder", type=Path, default=Path("teaching"), help="where data and policies are kept")
 
 
 def run(args: argparse.Namespace) -> Report:
-    procedures = list(dict.fromkeys(procedure_of(name) for name in args.data))
+    comparisons = [compared(args, cost) for cost in (None, *([args.cost] if args.cost else []))]
+    results = [each for _, of_table in comparisons for each in of_table]
+    tables, players = [table for table, _ in comparisons], results[0]["sealed"][SOLVED]
+    return Report("Which data teaches best", results, tables, notes(args, players))
+
+
+def notes(args: argparse.Namespace, players: Mapping[str, Any]) -> list[str]:
+    """Say what is compared, and how."""
+    settings = f", with {' '.join(f'`{setting}`' for setting in args.set)}" if args.set else ""
+    at_cost = (
+        f" In the second, each kind of data cost about {args.cost:,.0f} core-seconds, and policies learn from all "
+        f"levels that are solved in them, with ids from there on, in {args.cost_updates:,} updates."
+    )
+    procedures = dict.fromkeys(map(procedure_of, args.data))
+    return [
+        "In the first table, all policies learn from the same levels, those that every procedure solves of the "
+        f"{args.levels:,} ids from {FIRST:,} on, in {args.updates:,} updates{settings}.{at_cost if args.cost else ''} "
+        f"Random actions solve {interval_text(players['random']['once'])} of the "
+        f"{players['random']['levels']:,} sealed levels.",
+        "; ".join(f"*{name}*: `levelproof generate {' '.join(DATA[name])}`" for name in procedures) + ".",
+        *(about(name) for name in args.data if name in DISTILLED),
+        "Core-seconds are CPU seconds, compiling included: of data those of the whole command, unsolved levels "
+        "included; of training those of all its commands, teachers included. Steps to the goal: the mean of the "
+        "witnesses.",
+    ]
+
+
+def compared(args: argparse.Namespace, cost: float | None) -> tuple[Table, list[dict[str, Any]]]:
+    """Compare the kinds of data on the same levels, or at the same cost."""
+    procedures = list(dict.fromkeys(map(procedure_of, args.data)))
     with ThreadPoolExecutor(len(own_cores())) as threads:
-        made = dict(zip(procedures, threads.map(lambda name: generated(args, name), procedures), strict=True))
-        data = {name: made[procedure_of(name)] for name in args.data}
-        common = set.intersection(*(one["solved"] for one in data.values()))
+        made = dict(zip(procedures, threads.map(lambda name: generated(args, name, cost), procedures), strict=True))
+        common = None if cost else sorted(set[int].intersection(*(set(one["steps"]) for one in made.values())))
         runs = [(name, seed) for seed in range(args.seeds) for name in args.data]
-        results = [*threads.map(lambda one: measured(args, data[one[0]], sorted(common), *one), runs)]
+        updates = args.cost_updates if cost else args.updates
+        of_run = lambda one: measured(args, made[procedure_of(one[0])], common, updates, *one)
+        results = [*threads.map(of_run, runs)]
     rows = [
-        [name, *facts(data[name], common), str(each["seed"]), f"{each['core_seconds']:,.0f}", *rates(each["sealed"])]
-        for name in args.data for each in results if each["data"] == name
-    ]  # fmt: skip
-    players = results[0]["sealed"][SOLVED]
-    head = ("data", "core-seconds of a solved level", "steps to goal", "seed", "core-seconds of training", *COLUMNS)
-    return Report(
-        "Which data teaches best",
-        results,
-        [Table(head, rows, "Share of sealed levels labelled solved that a policy solves; 95% intervals over levels")],
         [
-            f"All policies learn from the same {len(common):,} levels, those among ids {FIRST:,} to "
-            f"{FIRST + args.levels - 1:,} that every procedure solves, and take {args.updates:,} updates"
-            f"{', with ' if args.set else ''}{' '.join(f'`{setting}`' for setting in args.set)}. Random actions solve "
-            f"{interval_text(players['random']['once'])} of the {players['random']['levels']:,} sealed levels.",
-            "; ".join(f"*{name}*: `levelproof generate {' '.join(DATA[name])}`" for name in procedures) + ".",
-            *([TEACHING] if TEACHERS in args.data else []),
-            "Core-seconds are CPU seconds, compiling included: of a solved level those of the whole command, "
-            "unsolved levels included; of training those of all its commands, teachers included. Steps to the goal: "
-            "the mean of the witnesses.",
-        ],
-    )  # fmt: skip
+            name,
+            *facts(made[procedure_of(name)], common),
+            str(each["seed"]),
+            f"{each['core_seconds']:,.0f}",
+            *rates(each["sealed"]),
+        ]
+        for name in args.data
+        for each in results
+        if each["data"] == name
+    ]
+    head = "data", "levels", "its core-seconds", "a solved level", "steps to goal", "seed", "of training", *COLUMNS
+    what = "at about the same cost of data" if cost else "on the same levels"
+    title = f"Share of sealed levels labelled solved that a policy solves, {what}; 95% intervals over levels"
+    return Table(head, rows, title), results
 
 
 def procedure_of(name: str) -> str:
     """Return which kind of DATA this learns from."""
-    return "label" if name == TEACHERS else name
+    return DISTILLED[name].data if name in DISTILLED else name
 
 
-def generated(args: argparse.Namespace, name: str) -> dict[str, Any]:
-    """Make a split; return where it is, its solved levels, and what they cost."""
-    out = args.folder / f"data-{slug(name)}"
-    spent = timed_split(out, "size=s", f"levels={args.levels}", f"first_level={FIRST}", *DATA[name])
+def about(name: str) -> str:
+    """Say what a distilled policy is."""
+    distilled = DISTILLED[name]
+    before = "a clone of half as many updates, then as many of " if distilled.cloned else ""
+    return f"*{name}*: {before}`levelproof distill {' '.join(distilled.settings)}`: {distilled.about}."
+
+
+def generated(args: argparse.Namespace, name: str, cost: float | None) -> dict[str, Any]:
+    """Make a split, as large as `cost` allows if there is one; return its solved levels, and what they cost."""
+    out, levels = args.folder / f"data-{slug(name)}", args.levels
+    make = lambda out, levels: timed_split(out, "size=s", f"levels={levels}", f"first_level={FIRST}", *DATA[name])
+    spent = make(out, levels)
+    if cost:
+        out, levels = out.with_name(f"{out.name}-{cost:.0f}"), round(levels * cost / spent)
+        spent = make(out, levels)
     split = out / DATA[name][0].removeprefix("budget=") / "s"
-    table = require_manifest(split, ["level_id", "label", "steps_to_goal"]).table
-    rows = {row["level_id"]: row for row in table.to_pylist()}
-    solved = {level_id for level_id, row in rows.items() if row["label"] == "solved"}
-    return {
-        "split": split,
-        "solved": solved,
-        "steps": {level_id: rows[level_id]["steps_to_goal"] for level_id in solved},
-        "core_seconds": spent,
-    }
+    rows = require_manifest(split, ["level_id", "label", "steps_to_goal"]).table.to_pylist()
+    steps = {row["level_id"]: row["steps_to_goal"] for row in rows if row["label"] == "solved"}
+    return {"split": split, "steps": steps, "core_seconds": spent}
 
 
-def measured(args: argparse.Namespace, data: Mapping[str, Any], common: Sequence[int], name: str, seed: int) -> Any:
-    """Train one policy, and measure it on sealed levels."""
-    policy = args.folder / f"clone-{slug(name)}-{seed}"
-    words = f"where=level_id IN ({', '.join(map(str, common))})", f"seed={seed}"
-    updates = f"train.updates={args.updates // 2 if name == TEACHERS else args.updates}"
-    command("clone", data["split"], "-o", policy, *words, updates, *args.set)
-    spent = lines_of(policy)[-1]["bc/core_seconds"]
-    if name == TEACHERS:
-        start, policy = policy, args.folder / f"distilled-{seed}"
-        command("distill", data["split"], "-o", policy, *words, updates, f"start={start}", *DISTILLING)
+def measured(
+    args: argparse.Namespace, data: Mapping[str, Any], levels: Sequence[int] | None, updates: int, name: str, seed: int
+) -> dict[str, Any]:
+    """Train one policy on these levels (None: on all that are solved), and measure it on sealed levels."""
+    of = data["split"].parents[1].name.removeprefix("data")  # of all data of the kind
+    where = f"level_id IN ({', '.join(map(str, levels))})" if levels else "label = 'solved'"
+    words = f"where={where}", f"seed={seed}", *args.set
+    policy, distilled, spent, start = args.folder / f"clone{of}-{seed}", DISTILLED.get(name), 0.0, ()
+    each = f"train.updates={updates // (1 + bool(distilled and distilled.cloned))}"
+    if not distilled or distilled.cloned:
+        policy = policy.with_name(f"{policy.name}-half") if distilled else policy
+        command("clone", data["split"], "-o", policy, *words, each)
+        spent, start = lines_of(policy)[-1]["bc/core_seconds"], (f"start={policy}",)
+    if distilled:
+        policy = args.folder / f"{slug(name)}{of}-{seed}"
+        own = words[:2] if start else words  # the start has the network
+        command("distill", data["split"], "-o", policy, *own, each, *start, *distilled.settings)
         spent += lines_of(policy)[-1]["distill/core_seconds"]
     sealed = kept(policy / "sealed.json", policy, "--attempts", ATTEMPTS, "--levels", args.measured)
     return {"data": name, "seed": seed, "core_seconds": spent, "sealed": sealed}
 
 
-def facts(data: Mapping[str, Any], common: set[int]) -> list[str]:
-    steps = np.mean([data["steps"][level_id] for level_id in common])
-    return [f"{data['core_seconds'] / len(data['solved']):.3f}", f"{steps:.1f}"]
+def facts(data: Mapping[str, Any], levels: Sequence[int] | None) -> list[str]:
+    steps = data["steps"]
+    learned, cost = levels or list(steps), data["core_seconds"]
+    mean = np.mean([steps[level_id] for level_id in learned])
+    return [f"{len(learned):,}", f"{cost:,.0f}", f"{cost / len(steps):.3f}", f"{mean:.1f}"]
 
 
 def rates(sealed: Mapping[str, Any]) -> list[str]:

@@ -21,8 +21,9 @@ class DistillConfig:
     pool: int = 16_384  # levels in memory, drawn evenly if the split has more
     interval: int = 100  # updates between rounds in which teachers label states; each ends with a checkpoint
     episodes: int = 512  # episodes that the learner plays in a round, each in another level
-    states: int = 256  # states of these episodes that teachers label in a round
+    states: int = 256  # states of these episodes that teachers label in a round; 0: none
     failed: float = 0.9  # share of these states from episodes that did not reach the goal
+    demonstrations: int = 0  # episodes with noise that kept experts play in a round, each in another level
     path: int = 16  # maximum env steps to learn from a teacher's path to the goal, evenly spaced; 1: only the first
     buffer: int = 65_536  # transitions of teachers in memory, the latest ones
     witnesses: float = 0.5  # share of the transitions of an update that are from the levels' witnesses
@@ -33,8 +34,11 @@ class DistillConfig:
     train: ImitationConfig = TRAIN  # training of the policy
 
     def __post_init__(self) -> None:
-        require(self, ("pool", "interval", "episodes", "states", "path", "buffer"), 1)
+        require(self, ("pool", "interval", "episodes", "path", "buffer"), 1)
+        require(self, ("states", "demonstrations"), 0)
         require(self, ("failed", "witnesses"), 0, 1)
         require(self, ("seed",), 0, 2**31 - 1)
         if self.witnesses == 1:
             raise ValueError("witnesses is 1: set it below 1, or nothing is learned from teachers")
+        if not (self.states or self.demonstrations):
+            raise ValueError("states and demonstrations are both 0: set one of them above 0, or use `levelproof clone`")

@@ -35,14 +35,17 @@ MAX_NOISE = 0.2  # largest probability that a variation of a witness draws an en
 
 @dataclass(frozen=True)
 class TeachersConfig:
-    """How often each teacher tries to reach the goal from a state; 0: it is not asked."""
+    """How often each teacher tries to reach the goal from a state (0: it is not asked), and noise of demonstrations."""
 
     expert: int = 4  # attempts of the level's expert from a state, if the split kept experts; 0: it is not asked
     witness: int = 16  # attempts of a search from a state that vary the level's witness
     random: int = 32  # attempts of a search from a state by sticky random actions
     learner: int = 4  # attempts of a search from a state by the learner itself
+    sticky: float = 0.5  # share of demonstrations in which the last action sometimes replaces the expert's
+    perturbed: float = 0.5  # share of demonstrations that start with perturbed velocities
 
     def __post_init__(self) -> None:
+        require(self, ("sticky", "perturbed"), 0, 1)
         require(self, ("expert", "witness", "random", "learner"), 0, 4096)
         if not (self.expert or self.searches):
             raise ValueError("expert, witness, random and learner are all 0: let at least one of them teach")

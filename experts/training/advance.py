@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from levelproof.experts.config import ExpertConfig
+from levelproof.experts.noise import PERTURBATION, STICKINESS, pushed
 from levelproof.experts.objective import advantages
 from levelproof.experts.policy import ActorCritic, network_of
 from levelproof.experts.training import ppo, progress, stop
@@ -31,9 +32,6 @@ from levelproof.levelgen.level import Level
 from levelproof.levelgen.programs import jit_stored
 from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.rules import TaskParams
-
-STICKINESS = 0.25  # probability of repeating the last action in sticky attempts (Machado et al. 2018, arXiv:1709.06009)
-PERTURBATION = 0.1  # m/s and rad/s, largest change of the level's velocities in perturbed attempts
 
 
 def over_slots(function: Callable, *slots: Any) -> Any:
@@ -236,21 +234,15 @@ def _perturbed_start(lanes: Level, keys: Key[Array, " slot"], config: ExpertConf
     first = config.attempts + config.sticky_attempts
     perturbed = jnp.tile((number >= first) & (number < first + config.perturbed_attempts), len(keys))
     acting = start(lanes)
-    state, movable = acting.world.state, (lanes.model.inverse_mass > 0) & lanes.model.active
 
     def noise(key):
-        shape = (3, len(movable), config.environments)
+        shape = (3, len(lanes.model.active), config.environments)
         return jax.random.uniform(
             jax.random.fold_in(key, config.horizon), shape, minval=-PERTURBATION, maxval=PERTURBATION
         )
 
-    drawn = jnp.moveaxis(jax.vmap(noise)(keys), 0, -2).reshape(3, len(movable), -1)
-    drawn = jnp.where(movable & perturbed, drawn, 0.0)
-    state = replace(
-        state,
-        velocity=state.velocity + jnp.moveaxis(drawn[:2], 0, 1),
-        angular_velocity=state.angular_velocity + drawn[2],
-    )
+    drawn = jnp.moveaxis(jax.vmap(noise)(keys), 0, -2).reshape(3, len(lanes.model.active), -1)
+    state = pushed(lanes, acting.world.state, jnp.where(perturbed, drawn, 0.0))
     return acting._replace(world=replace(acting.world, state=state))
 
 

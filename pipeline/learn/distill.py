@@ -1,7 +1,7 @@
 """Imitation of teachers at the learner's own states, round after round (DAgger, Ross et al. 2011, arXiv:1011.0686).
 
-In a round, the learner plays, teachers label states of its episodes, and updates follow. Everything that decides how a
-run continues is in its checkpoint or follows from the settings and the round's number.
+In a round, the learner plays, teachers label states of its episodes (`rounds.py`), and updates follow. Everything that
+decides how a run continues is in its checkpoint or follows from the settings and the round's number.
 """
 
 import time
@@ -11,33 +11,17 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Int, Int8
 from rich.console import Console
 
 from levelproof.configs.convert import plain
 from levelproof.configs.distill import DistillConfig
-from levelproof.experts.config import RECORD_STEPS
-from levelproof.experts.evaluation import first_actions, play_sampled
-from levelproof.experts.generalist.teachers import (
-    AT_ONCE,
-    Asked,
-    KnownExperts,
-    Labels,
-    Teacher,
-    label_states,
-    no_experts,
-)
-from levelproof.experts.generalist.visited import draw_states, visit
+from levelproof.experts.generalist.teachers import no_experts
 from levelproof.experts.imitation import Imitation, Likeness, Transitions, begin_imitation, imitate
 from levelproof.experts.labels import Label
 from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind
 from levelproof.experts.networks.saved import Policy
-from levelproof.levelgen.batching import blocks, take
-from levelproof.levelgen.identity.keys import key_of_seed
-from levelproof.levelgen.level import Level
-from levelproof.levelgen.task.rules import TaskParams
+from levelproof.levelgen.batching import take
 from levelproof.pipeline.dataset.dataset import Dataset
-from levelproof.pipeline.dataset.order import EpochOrder
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.learn.curves import BLUE, GREEN, Curves, Panel
@@ -53,9 +37,10 @@ from levelproof.pipeline.learn.folder import (
     write_note,
 )
 from levelproof.pipeline.learn.kept_experts import experts_of
-from levelproof.pipeline.learn.labelled import LabelBuffer, empty_labels, with_labels
+from levelproof.pipeline.learn.labelled import LabelBuffer, empty_labels
 from levelproof.pipeline.learn.metrics import Metrics
-from levelproof.pipeline.learn.pool import LevelPool, read_pool
+from levelproof.pipeline.learn.pool import read_pool
+from levelproof.pipeline.learn.rounds import TaughtLevels, teach
 from levelproof.pipeline.learn.sealed import require_not_sealed, require_some_usable, without_sealed
 from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.runtime import prepare_jax
@@ -73,25 +58,6 @@ COURSE = Curves(
     {GREEN: "the learner's episodes", BLUE: "by a teacher"},
 )
 WITHOUT_EFFECT = ("log",)  # settings that a continued run may change
-ASKING = 7  # folded into the seed's key; `experts.generalist.train` takes 1 to 4
-
-
-class TaughtLevels(NamedTuple):
-    """The levels of a run, with what teachers know of them."""
-
-    split: Path
-    facts: dict[str, Any]  # what identifies them, as JSON
-    level_ids: Int[np.ndarray, " level"]
-    levels: Level  # with first states; on the host, level axis last
-    witnesses: LevelPool
-    experts: KnownExperts
-    rules: TaskParams
-
-    def witness_of(self, levels: Int[np.ndarray, " state"]) -> Int8[np.ndarray, "256 6 state"]:
-        """Return the witnesses of levels; the last action is repeated."""
-        pool = self.witnesses
-        row = pool.first[levels] + np.minimum(np.arange(RECORD_STEPS)[:, None], pool.steps[levels] - 1)
-        return np.moveaxis(pool.action[row], -1, 1)
 
 
 class Distillation(NamedTuple):
@@ -99,15 +65,6 @@ class Distillation(NamedTuple):
 
     imitation: Imitation
     labels: LabelBuffer
-
-
-class Answers(NamedTuple):
-    """What a round of questions finds out."""
-
-    level: Int[np.ndarray, " state"]  # index of each state's level
-    labels: Labels
-    solved: float  # share of the learner's episodes
-    env_steps: int  # of the learner and its teachers
 
 
 def distill(split: Path, config: DistillConfig, out: Path, console: Console) -> None:
@@ -181,11 +138,13 @@ def levels_for(split: Path, config: DistillConfig, network: NetworkConfig, tell:
         "ids": data.fingerprint,
         "copies_of_sealed": int((~usable).sum()),
     }
-    experts = experts_of(split, ids[chosen]) if config.teachers.expert else no_experts(len(chosen))
-    if not (experts.config or config.teachers.searches):
+    wanted = config.teachers.expert or config.demonstrations
+    experts = experts_of(split, ids[chosen]) if wanted else no_experts(len(chosen))
+    if not experts.config and (config.demonstrations or not config.teachers.searches):
+        remedy = "set demonstrations=0" if config.demonstrations else "set teachers.random above 0"
         raise UserError(
-            f"{split} kept no experts of these levels, and no other teacher is asked: set teachers.random above 0, or "
-            "make the split with keep_experts=true."
+            f"{split} kept no experts of these levels, which is all that would teach: {remedy}, or make the split with "
+            "keep_experts=true."
         )
     return TaughtLevels(
         split, facts, ids[chosen], data.levels(chosen), read_pool(data, chosen, network), experts, data.rules
@@ -217,23 +176,26 @@ def update_until_done(
     before, began = metrics.last.get("distill/core_seconds", 0.0), time.monotonic()
     with shown(console, "compiling", last, first) as show:
         for update in range(first, last, config.interval):
-            show(0, f"{update:,}/{last:,} updates · asking teachers about {config.states} states")
-            asked = ask(taught, config, network, now.imitation, update // config.interval)
-            now = now._replace(labels=with_labels(now.labels, asked.level, asked.labels, config.path))
+            show(0, f"{update:,}/{last:,} updates · teachers at work")
+            number = update // config.interval
+            labels, numbers = teach(taught, config, network, now.imitation.average, now.labels, number)
+            now = now._replace(labels=labels)
             if not now.labels.filled and not config.witnesses:
                 raise UserError(
-                    f"No teacher reached the goal from any of {config.states} states: set witnesses above 0, or raise "
-                    "states or teachers.random, and choose another folder with -o."
+                    "No teacher reached the goal from any state: set witnesses above 0, or raise states or "
+                    "teachers.random, and choose another folder with -o."
                 )
             until = min(update + config.interval, last)
             now, recent = learn(taught, config, network, now, until)
-            numbers = numbers_of(asked, recent, until)
+            numbers = {COURSE.step: until, **numbers, **likeness_of(recent)}
             numbers["distill/core_seconds"] = before + time.process_time()
             require_finite(numbers["distill/loss"], "train.learning_rate")
-            words = (
-                f"{until:,}/{last:,} updates · {asked.solved:.1%} solved · {numbers['distill/labelled']:.1%} of states "
-                "labelled"
+            by_teachers = (
+                f"{numbers['distill/labelled']:.1%} of states labelled"
+                if config.states
+                else f"{numbers['distill/demonstrated']:.1%} of demonstrations reach the goal"
             )
+            words = f"{until:,}/{last:,} updates · {numbers['distill/solve_rate']:.1%} solved · {by_teachers}"
             if update == first:
                 began = time.monotonic()  # compiling does not count
             else:
@@ -243,30 +205,6 @@ def update_until_done(
             save(now)
             show(until - update, words, keep=True)
     return now
-
-
-def ask(
-    taught: TaughtLevels, config: DistillConfig, network: NetworkConfig, learner: Imitation, number: int
-) -> Answers:
-    """Let the learner play, and ask teachers about states of its episodes; `number` is the round's."""
-    rng = np.random.default_rng([config.seed, number, ASKING])
-    count = len(taught.level_ids)
-    chosen, _ = EpochOrder(count, min(count, config.episodes), config.seed).items(number)
-    levels, ids = take(taught.levels, chosen), taught.level_ids[chosen].astype(np.int32)
-    seed = int(rng.integers(2**31))
-    action = first_actions(play_sampled(network), learner.average, levels, ids, seed, taught.rules)
-    whole: Any = jax.device_get(visit(levels, action, np.zeros(len(ids), np.int32), taught.rules))
-    episode, at = draw_states(rng, whole.steps, whole.solved, config.states, config.failed)
-    parts = []
-    for some in blocks(len(at), AT_ONCE):
-        of_block = take(levels, episode[some]), action[..., episode[some]], at[some]
-        parts.append(jax.device_get(visit(*of_block, taught.rules)).now)
-    states = take(jax.tree.map(lambda *xs: np.concatenate(xs, -1), *parts), np.arange(len(at)))
-    level = chosen[episode]
-    asked = Asked(take(levels, episode), states, taught.witness_of(level))
-    key = jax.random.fold_in(jax.random.fold_in(key_of_seed(config.seed), ASKING), number)
-    labels = label_states(asked, taught.experts.of(level), learner.average, network, config.teachers, key, taught.rules)
-    return Answers(level, labels, float(whole.solved.mean()), int(whole.steps.sum()) + labels.env_steps)
 
 
 def learn(
@@ -296,20 +234,7 @@ def batches(taught: TaughtLevels, labels: LabelBuffer, config: DistillConfig, up
         )
 
 
-def numbers_of(asked: Answers, recent: Sequence[Likeness], update: int) -> dict[str, float]:
-    """Return the metrics of a round and its updates."""
-    labels, count = asked.labels, len(asked.level)
-    by = {f"distill/by_{each.name.lower()}": int((labels.teacher == each).sum()) for each in Teacher if each}
-    labelled = labels.length > 0
-    return {
-        COURSE.step: update,
-        "distill/solve_rate": asked.solved,
-        "distill/asked": count,
-        **by,
-        "distill/none": int((~labelled).sum()),
-        "distill/labelled": float(labelled.mean()),
-        "distill/steps_to_goal": float(labels.length[labelled].mean()) if labelled.any() else np.nan,
-        "distill/env_steps": asked.env_steps,
-        "distill/loss": float(np.mean([each.loss for each in recent])),
-        "distill/accuracy": float(np.mean([each.accuracy for each in recent])),
-    }
+def likeness_of(recent: Sequence[Likeness]) -> dict[str, float]:
+    """Return the metrics of a round's updates."""
+    means = [float(np.mean(column)) for column in zip(*recent, strict=True)]
+    return dict(zip(("distill/loss", "distill/accuracy"), means, strict=True))

@@ -7,8 +7,8 @@ import jax
 import numpy as np
 
 from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.noise import PERTURBATION, STICKINESS
 from levelproof.experts.training import advance, rollout
-from levelproof.experts.training.advance import PERTURBATION, STICKINESS
 from levelproof.experts.training.slots import Slot, Training
 from levelproof.experts.witness.success import Success
 from levelproof.levelgen.batching import repeat

@@ -19,7 +19,7 @@ from levelproof.experts.labels import Label
 from levelproof.experts.networks.over_levels import NetworkConfig
 from levelproof.experts.verdict.judge import KeptExpert
 from levelproof.pipeline.learn import distill as module
-from levelproof.pipeline.learn import kept_experts, sealed
+from levelproof.pipeline.learn import kept_experts, rounds, sealed
 from levelproof.pipeline.learn.kept_experts import experts_of
 from levelproof.pipeline.learn.labelled import empty_labels, with_labels
 from levelproof.pipeline.learn.pool import LevelPool
@@ -63,8 +63,16 @@ def test_every_state_has_a_teacher_or_none(policy: Path) -> None:
 def test_kept_experts_of_a_split_label_states(tmp_path: Path) -> None:
     job = ["generate", "levels=16", "budget=5k", "keep_experts=true", "executor=inline"]
     assert here(job, tmp_path).returncode == 0
-    out = distilled(tmp_path, tmp_path / "data/5k/s", *TINY, "teachers.expert=4")
+    shown = "demonstrations=8", "path=4"
+    out = distilled(tmp_path, tmp_path / "data/5k/s", *TINY, "teachers.expert=4", *shown)
     assert sum(line["distill/by_expert"] for line in metrics(out)) > 0
+    added = load_file(out / "checkpoint.safetensors")[".labels.added"]
+    out.rename(tmp_path / "both")
+    out = distilled(tmp_path, tmp_path / "data/5k/s", *TINY, "states=0", *shown)
+    for line in metrics(out):
+        assert line["distill/asked"] == line["distill/none"] == 0
+        assert 0 < line["distill/demonstrated"] <= 1
+    assert 0 < load_file(out / "checkpoint.safetensors")[".labels.added"] < added
 
 
 @pytest.mark.slow
@@ -160,9 +168,9 @@ def test_batches_mix_transitions_of_witnesses_and_of_teachers() -> None:
 
 @pytest.mark.slow
 def test_run_without_any_label_says_so(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "label_states", lambda asked, *_: labels_of([0] * 16, 6 * asked.level.size.bodies))
+    monkeypatch.setattr(rounds, "label_states", lambda asked, *_: labels_of([0] * 16, 6 * asked.level.size.bodies))
     done = here(["distill", str(split), "-o", "policy", *ROUNDS, *TINY, "witnesses=0"], tmp_path)
-    assert_refused(done, 2, "No teacher reached the goal from any of 16 states")
+    assert_refused(done, 2, "No teacher reached the goal from any state")
 
 
 @pytest.mark.slow
@@ -244,6 +252,9 @@ def test_levels_are_witnessed_and_neither_trivial_nor_sealed(split: Path, monkey
             "network.width cannot change the network",
         ),
         (["SPLIT", "witnesses=1"], "witnesses is 1"),
+        (["SPLIT", "states=0"], "states and demonstrations are both 0"),
+        (["SPLIT", "demonstrations=4"], "kept no experts of these levels, which is all that would teach"),
+        (["SPLIT", "teachers.sticky=2"], "teachers.sticky is 2"),
         (["SPLIT", "failed=2"], "failed is 2"),
         (["SPLIT", "teachers.witness=0", "teachers.random=0", "teachers.learner=0"], "kept no experts"),
         (["SPLIT", "teachers.random=-1"], "teachers.random is -1"),

@@ -1,0 +1,147 @@
+"""Rounds of distilling: the learner plays, teachers label states of its episodes, and experts show their levels."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from flax.typing import VariableDict
+from jaxtyping import Array, Bool, Int, Int8, Key
+
+from levelproof.configs.distill import DistillConfig
+from levelproof.experts.config import RECORD_STEPS
+from levelproof.experts.evaluation import first_actions, play_sampled
+from levelproof.experts.generalist.demonstrations import demonstrations
+from levelproof.experts.generalist.teachers import AT_ONCE, Asked, KnownExperts, Labels, Teacher, label_states
+from levelproof.experts.generalist.visited import draw_states, visit
+from levelproof.experts.networks.over_levels import NetworkConfig
+from levelproof.levelgen.batching import blocks, take
+from levelproof.levelgen.identity.keys import key_of_seed
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.rules import TaskParams
+from levelproof.pipeline.dataset.order import EpochOrder
+from levelproof.pipeline.learn.labelled import LabelBuffer, with_labels
+from levelproof.pipeline.learn.pool import LevelPool
+
+ASKING, SHOWING = 7, 8  # folded into the seed's key; `experts.generalist.train` takes 1 to 4
+
+
+class TaughtLevels(NamedTuple):
+    """The levels of a run, with what teachers know of them."""
+
+    split: Path
+    facts: dict[str, Any]  # what identifies them, as JSON
+    level_ids: Int[np.ndarray, " level"]
+    levels: Level  # with first states; on the host, level axis last
+    witnesses: LevelPool
+    experts: KnownExperts
+    rules: TaskParams
+
+    def witness_of(self, levels: Int[np.ndarray, " state"]) -> Int8[np.ndarray, "256 6 state"]:
+        """Return the witnesses of levels; the last action is repeated."""
+        pool = self.witnesses
+        row = pool.first[levels] + np.minimum(np.arange(RECORD_STEPS)[:, None], pool.steps[levels] - 1)
+        return np.moveaxis(pool.action[row], -1, 1)
+
+
+class Taught(NamedTuple):
+    """Labels, and the levels that they are of."""
+
+    level: Int[np.ndarray, " state"]  # index of each state's level
+    labels: Labels
+
+
+class LearnerEpisodes(NamedTuple):
+    """The learner's episodes of a round."""
+
+    level: Int[np.ndarray, " episode"]  # index of each episode's level
+    levels: Level
+    action: Int8[np.ndarray, "256 6 episode"]
+    steps: Int[np.ndarray, " episode"]
+    solved: Bool[np.ndarray, " episode"]
+
+
+def teach(
+    taught: TaughtLevels,
+    config: DistillConfig,
+    network: NetworkConfig,
+    learner: VariableDict,
+    labels: LabelBuffer,
+    number: int,
+) -> tuple[LabelBuffer, dict[str, float]]:
+    """Return `labels` with those of round `number`, and the round's metrics."""
+    rng = np.random.default_rng([config.seed, number, ASKING])
+    key = key_of_seed(config.seed)
+    asking, showing = (jax.random.fold_in(jax.random.fold_in(key, purpose), number) for purpose in (ASKING, SHOWING))
+    played = play(taught, config, network, learner, number, int(rng.integers(2**31)))
+    asked = ask(taught, config, network, learner, played, rng, asking) if config.states else None
+    shown = shown_by_experts(taught, config, network, showing, number) if config.demonstrations else None
+    for each in (asked, shown):
+        if each:
+            labels = with_labels(labels, *each, config.path)
+    return labels, numbers_of(played, asked, shown)
+
+
+def play(
+    taught: TaughtLevels, config: DistillConfig, network: NetworkConfig, learner: VariableDict, number: int, seed: int
+) -> LearnerEpisodes:
+    """Let the learner play the levels of round `number`; `seed` decides its actions."""
+    count = len(taught.level_ids)
+    chosen, _ = EpochOrder(count, min(count, config.episodes), config.seed).items(number)
+    levels, ids = take(taught.levels, chosen), taught.level_ids[chosen].astype(np.int32)
+    action = first_actions(play_sampled(network), learner, levels, ids, seed, taught.rules)
+    whole: Any = jax.device_get(visit(levels, action, np.zeros(len(ids), np.int32), taught.rules))
+    return LearnerEpisodes(chosen, levels, action, whole.steps, whole.solved)
+
+
+def ask(
+    taught: TaughtLevels,
+    config: DistillConfig,
+    network: NetworkConfig,
+    learner: VariableDict,
+    played: LearnerEpisodes,
+    rng: np.random.Generator,
+    key: Key[Array, ""],
+) -> Taught:
+    """Ask the teachers about states of the learner's episodes; `rng` and `key` are consumed."""
+    episode, at = draw_states(rng, played.steps, played.solved, config.states, config.failed)
+    parts = []
+    for some in blocks(len(at), AT_ONCE):
+        of_block = take(played.levels, episode[some]), played.action[..., episode[some]], at[some]
+        parts.append(jax.device_get(visit(*of_block, taught.rules)).now)
+    states = take(jax.tree.map(lambda *xs: np.concatenate(xs, -1), *parts), np.arange(len(at)))
+    level = played.level[episode]
+    asked = Asked(take(played.levels, episode), states, taught.witness_of(level))
+    experts = taught.experts.of(level)
+    return Taught(level, label_states(asked, experts, learner, network, config.teachers, key, taught.rules))
+
+
+def shown_by_experts(
+    taught: TaughtLevels, config: DistillConfig, network: NetworkConfig, key: Key[Array, ""], number: int
+) -> Taught:
+    """Let the experts of round `number` show their levels, with noise; `key` is consumed."""
+    known = np.flatnonzero(taught.experts.expert >= 0)
+    chosen, _ = EpochOrder(len(known), min(len(known), config.demonstrations), config.seed).items(number)
+    level = known[chosen]
+    noise = config.teachers.sticky, config.teachers.perturbed
+    levels, experts = take(taught.levels, level), taught.experts.of(level)
+    return Taught(level, demonstrations(levels, experts, *noise, network.reads_contacts, key, taught.rules))
+
+
+def numbers_of(played: LearnerEpisodes, asked: Taught | None, shown: Taught | None) -> dict[str, float]:
+    """Return the metrics of a round's episodes and labels."""
+    teacher, length = (asked.labels.teacher, asked.labels.length) if asked else (np.zeros(0, int), np.zeros(0, int))
+    by = {f"distill/by_{each.name.lower()}": int((teacher == each).sum()) for each in Teacher if each}
+    labelled = length > 0
+    mean = lambda x: float(x.mean()) if len(x) else np.nan
+    teachers = sum(each.labels.env_steps for each in (asked, shown) if each)
+    return {
+        "distill/solve_rate": float(played.solved.mean()),
+        "distill/asked": len(length),
+        **by,
+        "distill/none": int((~labelled).sum()),
+        "distill/labelled": mean(labelled),
+        "distill/steps_to_goal": mean(length[labelled]),
+        "distill/demonstrated": mean(shown.labels.length > 0) if shown else np.nan,
+        "distill/env_steps": int(played.steps.sum()) + teachers,
+    }
