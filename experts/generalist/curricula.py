@@ -5,7 +5,7 @@ id, so only ids are stored; `evolve` also stores the levels that it edits. `lear
 their own modules.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -42,6 +42,7 @@ class Curriculum(NamedTuple):
     every: int = 0  # updates between calls of `measure` or `breed`; 0: never
     measure: Callable[[Table, Attempt, Key[Array, ""]], State] | None = None  # attempts levels
     breed: Callable[[State, np.random.Generator], State] | None = None  # makes levels; runs on the host
+    facts: Callable[[State], Mapping[str, float]] = lambda state: {}  # metrics of the state; runs on the host
 
 
 def fresh(table: Table, key: Key[Array, ""], lanes: int) -> Int[Array, " lane"]:

@@ -21,6 +21,7 @@ from levelproof.experts.generalist.replay import (
     chance,
     drawn_from,
     empty,
+    facts_of,
     learned,
     replayed,
     waiting,
@@ -51,6 +52,7 @@ def evolve(config: EvolveConfig, buffer: ReplayConfig, sampler: Sampler, rules: 
         learn=lambda now, ended: now._replace(buffer=learned(buffer, now.buffer, ended)),
         table=lambda table, now: ExtendedTable(sampler, now.levels),
         breed=partial(_breed, config, buffer, sampler, rules),
+        facts=_facts_of,
         every=config.every,
     )
 
@@ -96,6 +98,14 @@ def _breed(
     buffer = buffer._replace(**{name: put(getattr(buffer, name), value) for name, value in values.items()})
     levels = jax.tree.map(lambda x, child: put(x, child[..., born]), now.levels, children)
     return Population(with_weights(replaying, buffer), levels, now.generation + 1)
+
+
+def _facts_of(now: Population) -> dict[str, float]:
+    """Return metrics of the buffer, the generations so far, and the share of attempted levels that are edited."""
+    index, score = np.asarray(now.buffer.level_index), np.asarray(now.buffer.score)
+    attempted = score > -np.inf
+    edited = float((index[attempted] >= FIRST_EXTRA).mean()) if attempted.any() else np.nan
+    return facts_of(now.buffer) | {"curriculum/edited": edited, "curriculum/generation": int(now.generation)}
 
 
 def _levels_of(now: Population, slots: np.ndarray, sampler: Sampler) -> Level:

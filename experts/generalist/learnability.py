@@ -55,4 +55,5 @@ def learnability(config: CurriculumConfig) -> Curriculum:
         return Learnable(candidates[best], (score > 0).sum(dtype=jnp.int32))
 
     nothing = lambda: Learnable(jnp.zeros(config.keep, jnp.int32), jnp.int32(0))
-    return Curriculum(nothing, draw, every=config.every, measure=measure)
+    facts = lambda state: {"curriculum/usable": int(state.usable)}
+    return Curriculum(nothing, draw, every=config.every, measure=measure, facts=facts)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from levelproof.experts.generalist.config import ReplayConfig
@@ -39,7 +40,7 @@ def replay(config: ReplayConfig) -> Curriculum:
         old, ready = replayed(buffer, of_choice, lanes)
         return jnp.where(ready & chance(config.share, of_share, lanes), old, fresh(table, of_fresh, lanes))
 
-    return Curriculum(partial(empty, config), draw, learn=partial(learned, config))
+    return Curriculum(partial(empty, config), draw, learn=partial(learned, config), facts=facts_of)
 
 
 def empty(config: ReplayConfig) -> ReplayBuffer:
@@ -112,6 +113,17 @@ def _by_level(ended: EndedEpisodes, some: Bool[Array, " episode"]) -> tuple[Arra
     sums = lambda x: jnp.zeros(len(some)).at[place].add(jnp.where(some, x, 0.0))
     episodes = sums(1.0)
     return levels, gained, jnp.where(episodes > 0, gained - sums(ended.expected) / jnp.maximum(episodes, 1), -jnp.inf)
+
+
+def facts_of(buffer: ReplayBuffer) -> dict[str, float]:
+    """Return metrics: the share of slots with an attempted level, the mean score of these, and whether replay began."""
+    score = np.asarray(buffer.score)
+    attempted = score > -np.inf
+    return {
+        "curriculum/filled": float(attempted.mean()),
+        "curriculum/score": float(score[attempted].mean()) if attempted.any() else np.nan,
+        "curriculum/replaying": int(buffer.cumulative[-1] > 0),
+    }
 
 
 def with_weights(config: ReplayConfig, buffer: ReplayBuffer) -> ReplayBuffer:

@@ -197,6 +197,7 @@ def update_until_done(
             if keep:
                 paused = time.monotonic()
                 numbers = {COURSE.step: update * per_update, "train/updates": update} | averages(recent)
+                numbers |= recipe.curriculum.facts(learner.curriculum)
                 numbers["train/env_steps_per_second"] = rate
                 numbers["train/core_seconds"] = before + time.process_time()
                 require_finite(numbers["loss/value"], "ppo.learning_rate")

@@ -133,6 +133,28 @@ def test_children_take_the_slots_of_low_scores_and_wait() -> None:
     assert set(names.tolist()) <= set(np.asarray(crowd.level_index).tolist()), "waiting children are not evicted"
 
 
+def test_facts_tell_how_full_and_how_edited_the_buffer_is() -> None:
+    nothing = EVOLVE.facts(EVOLVE.begin())
+    assert (nothing["curriculum/filled"], nothing["curriculum/replaying"]) == (0, 0)
+    assert np.isnan([nothing["curriculum/score"], nothing["curriculum/edited"]]).all()
+    before, after = bred()
+    facts = EVOLVE.facts(before)
+    assert (facts["curriculum/filled"], facts["curriculum/replaying"], facts["curriculum/edited"]) == (1, 1, 0)
+    assert facts["curriculum/score"] == pytest.approx(np.mean([1 - level / 100 for level in range(32)]))
+    new = np.asarray(waiting(after.buffer))
+    played = after._replace(
+        buffer=learned(
+            EVOLVING, after.buffer, episodes(*((name, 1, 0.5) for name in np.asarray(after.buffer.level_index)[new]))
+        )
+    )
+    assert EVOLVE.facts(after)["curriculum/filled"] == pytest.approx(1 - new.mean()), "children wait"
+    assert EVOLVE.facts(played) == facts | {
+        "curriculum/score": pytest.approx(np.asarray(played.buffer.score).mean()),
+        "curriculum/edited": pytest.approx(new.mean()),
+        "curriculum/generation": 1,
+    }
+
+
 def test_half_of_unreplayed_episodes_play_waiting_children() -> None:
     _, after = bred()
     drawn = np.asarray(EVOLVE.draw(EVOLVE.table(sampler("s"), after), after, KEY, 20_000))

@@ -200,6 +200,7 @@ def test_levels_are_measured_for_learnability(of_split: bool, split: Path, tmp_p
     kept = load_file(out / "checkpoint.safetensors")
     usable = next(x for name, x in kept.items() if name.endswith("usable"))
     assert 0 < usable <= 16
+    assert metrics(out)[-1]["curriculum/usable"] == usable
 
 
 @pytest.mark.campaign
@@ -210,6 +211,7 @@ def test_levels_are_replayed(of_split: bool, split: Path, tmp_path: Path) -> Non
     kept = {name: x for name, x in load_file(out / "checkpoint.safetensors").items() if name.startswith(".curriculum")}
     assert kept[".curriculum.cumulative"][-1] > 0
     assert np.isfinite(kept[".curriculum.score"]).all()
+    assert metrics(out)[-1]["curriculum/replaying"] == metrics(out)[-1]["curriculum/filled"] == 1
 
 
 def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
