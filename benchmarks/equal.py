@@ -34,6 +34,13 @@ BETWEEN_SEEDS = 10_000_000  # ids
 LARGE = ("ppo.environments=2048", "ppo.epochs=2")  # fewer, larger steps than the defaults'
 SCRATCH = (*LARGE, "ppo.learning_rate=3e-4", "ppo.entropy_weight=0.005", "network.width=64")
 TUNING = (*LARGE, "ppo.learning_rate=2e-4", "ppo.entropy_weight=0.002", "ppo.critic_updates=5")
+OFTEN = (  # the defaults measure four times in 50 million env steps, and keep 256 levels for 2,048 lanes
+    "curriculum.every=16",
+    "curriculum.candidates=4096",
+    "curriculum.measured_steps=512",
+    "curriculum.keep=1536",
+    "curriculum.share=0.75",
+)
 PLOT = "equal.svg"
 UPDATES = "train/updates"
 SETTLED = 5  # updates, after which lines no longer favour short episodes
@@ -62,6 +69,7 @@ WAYS = {
     "from scratch": Way(SCRATCH, colour="#0072b2"),
     "from scratch, by default": Way(("network.width=64",), colour="#332288"),
     "from scratch, learnability": Way((*SCRATCH, "levels=learnability"), colour="#56b4e9"),
+    "from scratch, learnability measured often": Way((*SCRATCH, "levels=learnability", *OFTEN), colour="#44aa99"),
     "from scratch, replay": Way((*SCRATCH, "levels=replay"), colour="#117733"),
     "from scratch, evolve": Way((*SCRATCH, "levels=evolve"), colour="#882255"),
     "levels, reinforcement on these levels": Way(SCRATCH, colour="#000000", own_levels=True),
@@ -69,7 +77,7 @@ WAYS = {
     "levels, clone, learnability": Way((*TUNING, "levels=learnability"), CLONE, "#e69f00"),
     "levels, clone, reinforcement on these levels": Way(TUNING, CLONE, "#cc79a7", own_levels=True),
     "levels, clone, learnability on these levels": Way(
-        (*TUNING, "choice=learnability"), CLONE, "#999933", own_levels=True
+        (*TUNING, "choice=learnability", *OFTEN), CLONE, "#999933", own_levels=True
     ),
     "levels, clone, teachers, reinforcement on these levels": Way(
         TUNING, CLONE, "#661100", own_levels=True, teachers=True
