@@ -267,6 +267,13 @@ def compose_distill(overrides: Sequence[str]) -> "DistillConfig":
 
     parsed = [_parse(text) for text in overrides]
     config = _changed(DistillConfig, parsed)
+    noise = ("teachers.sticky", "teachers.perturbed")
+    asking = ("failed", *(f"teachers.{name}" for name in ("expert", "witness", "random", "learner")))
+    for setting in parsed:
+        if setting.key_or_group in noise and not config.demonstrations:
+            raise ConfigError(f"{setting.key_or_group} has no effect without demonstrations: leave it out.")
+        if setting.key_or_group in asking and not config.states:
+            raise ConfigError(f"{setting.key_or_group} has no effect with states=0: leave it out.")
     _require_no_network(config.start, parsed)
     _require_heads(config.network.kind, parsed)
     return config

@@ -41,8 +41,8 @@ class TeachersConfig:
     witness: int = 16  # attempts of a search from a state that vary the level's witness
     random: int = 32  # attempts of a search from a state by sticky random actions
     learner: int = 4  # attempts of a search from a state by the learner itself
-    sticky: float = 0.5  # share of demonstrations in which the last action sometimes replaces the expert's
-    perturbed: float = 0.5  # share of demonstrations that start with perturbed velocities
+    sticky: float = 0.5  # share of demonstrations in which the action executed last sometimes replaces the expert's
+    perturbed: float = 0.5  # share of demonstrations that start with perturbed velocities, drawn independently
 
     def __post_init__(self) -> None:
         require(self, ("sticky", "perturbed"), 0, 1)
@@ -82,7 +82,10 @@ class Found(NamedTuple):
 
 
 class Labels(NamedTuple):
-    """What teachers do in the states that they were asked about, on the host."""
+    """What teachers do in the states that they were asked about, or demonstrate, on the host.
+
+    An answer replays to the goal. A demonstration has what its expert chose, whether or not that was executed.
+    """
 
     teacher: Int[np.ndarray, " state"]  # Teacher
     length: Int[np.ndarray, " state"]  # env steps from the state to the goal; 0: no label

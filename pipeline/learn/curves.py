@@ -8,10 +8,10 @@ import numpy as np
 
 from levelproof.levelgen.level import Role
 from levelproof.levelgen.pictures.shapes import disc, line, text, text_width
-from levelproof.levelgen.pictures.style import GRID, INK, MUTED, ROLE_COLOUR, Colour
+from levelproof.levelgen.pictures.style import BINDING_COLOUR, GRID, INK, MUTED, ROLE_COLOUR, Colour
 from levelproof.pipeline.look.figures import LETTER, SMALL, write_figure
 
-GREEN, BLUE = ROLE_COLOUR[Role.GREEN], ROLE_COLOUR[Role.BLUE]
+GREEN, BLUE, YELLOW = ROLE_COLOUR[Role.GREEN], ROLE_COLOUR[Role.BLUE], BINDING_COLOUR[0]
 
 
 class Panel(NamedTuple):

@@ -24,7 +24,7 @@ from levelproof.levelgen.batching import take
 from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs.progress import say
-from levelproof.pipeline.learn.curves import BLUE, GREEN, Curves, Panel
+from levelproof.pipeline.learn.curves import BLUE, GREEN, YELLOW, Curves, Panel
 from levelproof.pipeline.learn.folder import (
     continued,
     keep_run,
@@ -53,9 +53,9 @@ COURSE = Curves(
     "updates",
     (
         Panel("Episodes that reach the goal", {GREEN: "distill/solve_rate"}, 1.0),
-        Panel("States with a label", {BLUE: "distill/labelled"}, 1.0),
+        Panel("Successes of teachers", {BLUE: "distill/labelled", YELLOW: "distill/demonstrated"}, 1.0),
     ),
-    {GREEN: "the learner's episodes", BLUE: "by a teacher"},
+    {GREEN: "the learner's episodes", BLUE: "states with a label", YELLOW: "demonstrations"},
 )
 WITHOUT_EFFECT = ("log",)  # settings that a continued run may change
 
@@ -138,13 +138,17 @@ def levels_for(split: Path, config: DistillConfig, network: NetworkConfig, tell:
         "ids": data.fingerprint,
         "copies_of_sealed": int((~usable).sum()),
     }
-    wanted = config.teachers.expert or config.demonstrations
-    experts = experts_of(split, ids[chosen]) if wanted else no_experts(len(chosen))
+    experts = no_experts(len(chosen))
+    if config.demonstrations or (config.states and config.teachers.expert):
+        experts = experts_of(split, ids[chosen])
+    if config.demonstrations:
+        tell(f"{int((experts.expert >= 0).sum()):,} of them have a kept expert")
     if not experts.config and (config.demonstrations or not config.teachers.searches):
-        remedy = "set demonstrations=0" if config.demonstrations else "set teachers.random above 0"
+        only = "demonstrations need them" if config.demonstrations else "no other teacher is asked"
+        remedy = "demonstrations=0 and states above 0" if config.demonstrations else "teachers.random above 0"
         raise UserError(
-            f"{split} kept no experts of these levels, which is all that would teach: {remedy}, or make the split with "
-            "keep_experts=true."
+            f"{split} has no kept experts of these levels, and {only}: set {remedy}, or make a split in a folder of "
+            "this machine with keep_experts=true."
         )
     return TaughtLevels(
         split, facts, ids[chosen], data.levels(chosen), read_pool(data, chosen, network), experts, data.rules
@@ -181,9 +185,10 @@ def update_until_done(
             labels, numbers = teach(taught, config, network, now.imitation.average, now.labels, number)
             now = now._replace(labels=labels)
             if not now.labels.filled and not config.witnesses:
+                more = "states or teachers.random" if config.states else "demonstrations"
                 raise UserError(
-                    "No teacher reached the goal from any state: set witnesses above 0, or raise states or "
-                    "teachers.random, and choose another folder with -o."
+                    f"No teacher reached the goal: set witnesses above 0, or raise {more}, and choose another folder "
+                    "with -o."
                 )
             until = min(update + config.interval, last)
             now, recent = learn(taught, config, network, now, until)

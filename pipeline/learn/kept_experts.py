@@ -18,7 +18,7 @@ from levelproof.pipeline.store.manifest import require_manifest
 from levelproof.pipeline.store.remote import is_remote
 from levelproof.pipeline.store.seed.file import is_seed
 
-WITHOUT = "set teachers.expert=0 to do without them"
+WITHOUT = "set teachers.expert=0 and demonstrations=0 to do without them"
 
 
 def experts_of(split: Path, level_ids: Int[np.ndarray, " level"]) -> KnownExperts:

@@ -1,5 +1,6 @@
 """Rounds of distilling: the learner plays, teachers label states of its episodes, and experts show their levels."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ from levelproof.pipeline.dataset.order import EpochOrder
 from levelproof.pipeline.learn.labelled import LabelBuffer, with_labels
 from levelproof.pipeline.learn.pool import LevelPool
 
+SHOWN_AT_ONCE = 256  # demonstrations that are played side by side
 ASKING, SHOWING = 7, 8  # folded into the seed's key; `experts.generalist.train` takes 1 to 4
 
 
@@ -75,11 +77,16 @@ def teach(
     asking, showing = (jax.random.fold_in(jax.random.fold_in(key, purpose), number) for purpose in (ASKING, SHOWING))
     played = play(taught, config, network, learner, number, int(rng.integers(2**31)))
     asked = ask(taught, config, network, learner, played, rng, asking) if config.states else None
-    shown = shown_by_experts(taught, config, network, showing, number) if config.demonstrations else None
-    for each in (asked, shown):
-        if each:
-            labels = with_labels(labels, *each, config.path)
-    return labels, numbers_of(played, asked, shown)
+    if asked:
+        labels = with_labels(labels, *asked, config.path)
+    numbers, reached = numbers_of(played, asked), []
+    for shown in shown_by_experts(taught, config, network, showing, number):
+        labels = with_labels(labels, *shown, config.path)
+        reached.append(shown.labels.length > 0)
+        numbers["distill/env_steps"] += shown.labels.env_steps
+    numbers["distill/demonstrations"] = sum(map(len, reached))
+    numbers["distill/demonstrated"] = float(np.concatenate(reached).mean()) if reached else np.nan
+    return labels, numbers
 
 
 def play(
@@ -118,23 +125,27 @@ def ask(
 
 def shown_by_experts(
     taught: TaughtLevels, config: DistillConfig, network: NetworkConfig, key: Key[Array, ""], number: int
-) -> Taught:
-    """Let the experts of round `number` show their levels, with noise; `key` is consumed."""
+) -> Iterator[Taught]:
+    """Yield what kept experts show in round `number`, in batches; `key` is consumed."""
     known = np.flatnonzero(taught.experts.expert >= 0)
-    chosen, _ = EpochOrder(len(known), min(len(known), config.demonstrations), config.seed).items(number)
-    level = known[chosen]
-    noise = config.teachers.sticky, config.teachers.perturbed
-    levels, experts = take(taught.levels, level), taught.experts.of(level)
-    return Taught(level, demonstrations(levels, experts, *noise, network.reads_contacts, key, taught.rules))
+    if not config.demonstrations:
+        return
+    # Another order than that of the levels that the learner plays
+    order = EpochOrder(len(known), min(len(known), config.demonstrations), config.seed + SHOWING)
+    level = known[order.items(number)[0]]
+    for first in range(0, len(level), SHOWN_AT_ONCE):
+        some = level[first : first + SHOWN_AT_ONCE]
+        of_batch = take(taught.levels, some), taught.experts.of(some), config.teachers.sticky, config.teachers.perturbed
+        of_key = jax.random.fold_in(key, first)
+        yield Taught(some, demonstrations(*of_batch, network.reads_contacts, of_key, taught.rules))
 
 
-def numbers_of(played: LearnerEpisodes, asked: Taught | None, shown: Taught | None) -> dict[str, float]:
-    """Return the metrics of a round's episodes and labels."""
+def numbers_of(played: LearnerEpisodes, asked: Taught | None) -> dict[str, float]:
+    """Return the metrics of the learner's episodes, and of what was asked about them."""
     teacher, length = (asked.labels.teacher, asked.labels.length) if asked else (np.zeros(0, int), np.zeros(0, int))
     by = {f"distill/by_{each.name.lower()}": int((teacher == each).sum()) for each in Teacher if each}
     labelled = length > 0
     mean = lambda x: float(x.mean()) if len(x) else np.nan
-    teachers = sum(each.labels.env_steps for each in (asked, shown) if each)
     return {
         "distill/solve_rate": float(played.solved.mean()),
         "distill/asked": len(length),
@@ -142,6 +153,5 @@ def numbers_of(played: LearnerEpisodes, asked: Taught | None, shown: Taught | No
         "distill/none": int((~labelled).sum()),
         "distill/labelled": mean(labelled),
         "distill/steps_to_goal": mean(length[labelled]),
-        "distill/demonstrated": mean(shown.labels.length > 0) if shown else np.nan,
-        "distill/env_steps": int(played.steps.sum()) + teachers,
+        "distill/env_steps": int(played.steps.sum()) + (asked.labels.env_steps if asked else 0),
     }

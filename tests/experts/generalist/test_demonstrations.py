@@ -8,7 +8,7 @@ from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.generalist.demonstrations import Demonstrations, demonstrate, demonstrations
 from levelproof.experts.generalist.teachers import KnownExperts, Teacher
 from levelproof.experts.imitation import MOTION, to_motion
-from levelproof.experts.noise import PERTURBATION
+from levelproof.experts.noise import PERTURBATION, STICKINESS
 from levelproof.experts.policy import forward, most_probable, network_of
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.sampling.sampler import sample_levels
@@ -57,8 +57,8 @@ def test_without_noise_the_chosen_actions_lead_to_the_goal_and_through_the_state
 def test_sticky_episodes_execute_the_last_action_now_and_then_and_show_the_chosen_one(levels: Level) -> None:
     one = shown(levels, STICKY, NO)
     now, executed = task.reset(levels), one.action[0]
-    repeated = NO
-    for step in range(8):
+    repeated, steps, sticks_in = NO, 12, 0
+    for step in range(steps):
         if step:
             follows, sticks = (advance(levels, now, action)[0] for action in (one.action[step], executed))
             as_chosen, as_before = (
@@ -67,9 +67,14 @@ def test_sticky_episodes_execute_the_last_action_now_and_then_and_show_the_chose
             assert (as_chosen | as_before).all()
             assert as_chosen[~STICKY].all()
             repeated = repeated | ~as_chosen
+            other = (one.action[step] != executed).any(0) & (one.env_steps > step + 1) & STICKY
+            sticks_in += np.array([other.sum(), (other & ~as_chosen).sum()])
             executed = np.where(as_chosen, one.action[step], executed)
         now, _ = advance(levels, now, executed)
-    assert 0 < repeated.sum() <= STICKY.sum()
+    assert repeated.any()
+    tried, stuck = sticks_in
+    assert tried > 30
+    assert stuck / tried == pytest.approx(STICKINESS, abs=0.2)
 
 
 def test_only_perturbed_episodes_start_with_other_velocities_of_what_can_move(levels: Level) -> None:
@@ -79,7 +84,7 @@ def test_only_perturbed_episodes_start_with_other_velocities_of_what_can_move(le
     at_rest = (levels.model.inverse_mass == 0) | ~levels.model.active
     assert not change[at_rest.T].any()
     velocities = np.abs(change[PERTURBED][~at_rest.T[PERTURBED]])
-    assert not velocities[:, :2].any()
+    assert not velocities[:, [0, 1, 4]].any(), "places and rotations stay"
     assert 0.8 * PERTURBATION < velocities.max() <= PERTURBATION * 1.001
 
 
@@ -98,3 +103,13 @@ def test_every_level_is_shown_by_its_own_expert(levels: Level) -> None:
         np.testing.assert_array_equal(labels.action[0, :, i], own)
     assert ((labels.teacher == Teacher.EXPERT) == (labels.length > 0)).all()
     assert labels.env_steps > 0
+
+
+def test_shares_of_noise_are_those_of_its_kinds(levels: Level) -> None:
+    """Sticky actions change no first state; perturbed velocities change every one in which something can move."""
+    known, key = experts_for(levels), jax.random.key(7)
+    of = lambda sticky, perturbed: demonstrations(levels, known, sticky, perturbed, False, key, DEFAULT_RULES)
+    plain, sticky, perturbed = of(0.0, 0.0), of(1.0, 0.0), of(0.0, 1.0)
+    np.testing.assert_array_equal(plain.motion[0], sticky.motion[0])
+    assert (plain.motion[1:8] != sticky.motion[1:8]).any()
+    assert (plain.motion[0] != perturbed.motion[0]).any(1).all()

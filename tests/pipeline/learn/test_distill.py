@@ -14,7 +14,7 @@ from safetensors.numpy import load_file
 import levelproof
 from levelproof.configs.compose import compose_distill
 from levelproof.configs.distill import DistillConfig
-from levelproof.experts.generalist.teachers import Labels
+from levelproof.experts.generalist.teachers import KnownExperts, Labels
 from levelproof.experts.labels import Label
 from levelproof.experts.networks.over_levels import NetworkConfig
 from levelproof.experts.verdict.judge import KeptExpert
@@ -60,7 +60,7 @@ def test_every_state_has_a_teacher_or_none(policy: Path) -> None:
 
 
 @pytest.mark.slow
-def test_kept_experts_of_a_split_label_states(tmp_path: Path) -> None:
+def test_kept_experts_of_a_split_label_states_and_demonstrate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     job = ["generate", "levels=16", "budget=5k", "keep_experts=true", "executor=inline"]
     assert here(job, tmp_path).returncode == 0
     shown = "demonstrations=8", "path=4"
@@ -68,11 +68,54 @@ def test_kept_experts_of_a_split_label_states(tmp_path: Path) -> None:
     assert sum(line["distill/by_expert"] for line in metrics(out)) > 0
     added = load_file(out / "checkpoint.safetensors")[".labels.added"]
     out.rename(tmp_path / "both")
-    out = distilled(tmp_path, tmp_path / "data/5k/s", *TINY, "states=0", *shown)
+    alone = "states=0", *TINY, *shown
+    keep = module.keep_run
+
+    def stopped(*arguments: Any) -> None:
+        keep(*arguments)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "keep_run", stopped)
+        here(["distill", "data/5k/s", "-o", "policy", *ROUNDS, *alone], tmp_path)
+    out = shown_alone(tmp_path, *alone)
+    weights = (out / "policy.safetensors").read_bytes()
     for line in metrics(out):
         assert line["distill/asked"] == line["distill/none"] == 0
+        assert line["distill/demonstrations"] == 8
         assert 0 < line["distill/demonstrated"] <= 1
     assert 0 < load_file(out / "checkpoint.safetensors")[".labels.added"] < added
+    out.rename(tmp_path / "stopped")
+    assert (shown_alone(tmp_path, *alone) / "policy.safetensors").read_bytes() == weights
+
+
+def shown_alone(folder: Path, *words: str) -> Path:
+    done = here(["distill", "data/5k/s", "-o", "policy", *ROUNDS, *words], folder)
+    assert done.returncode == 0, done.stderr
+    return folder / "policy"
+
+
+def test_levels_without_an_expert_are_not_demonstrated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every round takes other levels, each shown by its own expert."""
+    experts, seen = np.where(np.arange(600) % 2, np.arange(600) // 2, -1), []
+
+    def demonstrations(levels: Any, known: KnownExperts, *_: Any) -> Labels:
+        seen.append((levels, known.expert))
+        return labels_of([3] * len(known.expert))
+
+    monkeypatch.setattr(rounds, "demonstrations", demonstrations)
+    known = KnownExperts(None, None, experts)
+    taught = SimpleNamespace(levels=np.arange(600), experts=known, rules=None)
+    config, network = DistillConfig(demonstrations=270), NetworkConfig()
+    shown = [list(rounds.shown_by_experts(taught, config, network, jax.random.key(0), i)) for i in (0, 1)]  # pyright: ignore
+    assert [[len(each.level) for each in one] for one in shown] == [[256, 14]] * 2
+    for one in shown:
+        levels = np.concatenate([each.level for each in one])
+        assert len(set(levels.tolist())) == 270
+        assert (levels % 2 == 1).all()
+    assert (shown[0][0].level != shown[1][0].level).any()
+    for levels, expert in seen:
+        np.testing.assert_array_equal(experts[levels], expert)
 
 
 @pytest.mark.slow
@@ -170,7 +213,7 @@ def test_batches_mix_transitions_of_witnesses_and_of_teachers() -> None:
 def test_run_without_any_label_says_so(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rounds, "label_states", lambda asked, *_: labels_of([0] * 16, 6 * asked.level.size.bodies))
     done = here(["distill", str(split), "-o", "policy", *ROUNDS, *TINY, "witnesses=0"], tmp_path)
-    assert_refused(done, 2, "No teacher reached the goal from any state")
+    assert_refused(done, 2, "No teacher reached the goal: set witnesses above 0")
 
 
 @pytest.mark.slow
@@ -253,10 +296,12 @@ def test_levels_are_witnessed_and_neither_trivial_nor_sealed(split: Path, monkey
         ),
         (["SPLIT", "witnesses=1"], "witnesses is 1"),
         (["SPLIT", "states=0"], "states and demonstrations are both 0"),
-        (["SPLIT", "demonstrations=4"], "kept no experts of these levels, which is all that would teach"),
-        (["SPLIT", "teachers.sticky=2"], "teachers.sticky is 2"),
+        (["SPLIT", "demonstrations=4"], "no kept experts of these levels, and demonstrations need them"),
+        (["SPLIT", "teachers.perturbed=1"], "teachers.perturbed has no effect without demonstrations"),
+        (["SPLIT", "states=0", "demonstrations=4", "failed=1"], "failed has no effect with states=0"),
+        (["SPLIT", "demonstrations=4", "teachers.sticky=2"], "teachers.sticky is 2"),
         (["SPLIT", "failed=2"], "failed is 2"),
-        (["SPLIT", "teachers.witness=0", "teachers.random=0", "teachers.learner=0"], "kept no experts"),
+        (["SPLIT", "teachers.witness=0", "teachers.random=0", "teachers.learner=0"], "no other teacher is asked"),
         (["SPLIT", "teachers.random=-1"], "teachers.random is -1"),
         (["SPLIT", "where=level_id < 0"], "has no trajectories for which level_id < 0"),
         (["SPLIT", "-o", "file"], "Cannot write a policy to file"),
