@@ -23,7 +23,10 @@ BENCHMARKS = {  # name: (module, what it measures)
     "solved": ("benchmarks.solved.command", "how many levels experts solve, how soon and at what cost"),
     "search": ("benchmarks.search", "how many more levels a longer search would solve"),
     "equal": ("benchmarks.equal", "learners at equal cost: what a core-hour gives, with and without data"),
-    "teaching": ("benchmarks.teaching", "which data teaches best: witnesses of several procedures, and teachers"),
+    "teaching": (
+        "benchmarks.teaching",
+        "which data teaches best: witnesses by several procedures, teachers, demonstrations",
+    ),
     "offline": ("benchmarks.offline", "offline reinforcement learning by TorchRL beside clones of the same levels"),
     "tuned": ("benchmarks.tuned", "what training on the handmade levels adds, and what it takes from scratch"),
     "late": ("benchmarks.late", "which levels only a long search solves, and how"),

@@ -176,15 +176,19 @@ def timed_split(out: Path, *words: Any) -> float:
     A split's own ledger has seconds of a clock, which other work on the machine makes longer.
 
     Raises:
+        UserError: an earlier run made another split there.
         Failure: a run that was stopped has left a part of the levels, whose seconds nobody knows.
     """
-    file = out.with_suffix(".json")
+    file, told = out.with_suffix(".json"), " ".join(map(str, words))
     if not file.exists():
         if out.exists():
             raise Failure(f"{out} was left by a run that was stopped: remove it, so that its search counts as a whole.")
         seconds = timed_command("generate", *words, f"out={out}", "executor=inline")[1]
-        file.write_text(json.dumps({"core_seconds": seconds}))
-    return json.loads(file.read_text())["core_seconds"]
+        file.write_text(json.dumps({"settings": told, "core_seconds": seconds}))
+    made = json.loads(file.read_text())
+    if made["settings"] != told:
+        raise UserError(f"{out} was made with {made['settings']}, not with {told}: choose another --folder.")
+    return made["core_seconds"]
 
 
 def row_of(kind: tuple[str, int], results: list[dict[str, Any]]) -> list[str]:
