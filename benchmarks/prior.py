@@ -74,6 +74,8 @@ def run(args: argparse.Namespace) -> Report:
             ]
         )
     name, tries = f"`{args.policy}`", args.attempts
+    total = lambda what: sum(one[what] for one in results)
+    ratios = [one["attempting"] / max(one["searching_found"], 1e-9) for one in results]
     commands = "; ".join(f"`{one['command']}`" for one in results)
     return Report(
         "Attempts of a policy before the search",
@@ -97,6 +99,10 @@ def run(args: argparse.Namespace) -> Report:
             "that the attempts solve*. They are timed in CPU seconds, without compiling; the other columns are seconds "
             "of a clock, from the manifest, which other work on the machine makes longer.",
             "The policy's steps are those of its shortest attempt that reaches the goal, on levels that both solve.",
+            f"So the attempts cost {', '.join(f'{ratio:.0f}' for ratio in ratios)} times what they could save "
+            f"({', '.join(one['size'] for one in results)}), and find {total('found_of_unsolved')} of "
+            f"{total('unsolved'):,} unsolved levels. That is why there is no setting for a policy that plays before "
+            "the search ([more](../tried/learners.md#a-policy-before-the-search)).",
         ],
     )
 
