@@ -31,6 +31,7 @@ BENCHMARKS = {  # name: (module, what it measures)
     "tuned": ("benchmarks.tuned", "what training on the handmade levels adds, and what it takes from scratch"),
     "late": ("benchmarks.late", "which levels only a long search solves, and how"),
     "prior": ("benchmarks.prior", "what attempts of a policy before the search would find and save"),
+    "ppo": ("benchmarks.ppo", "env steps/s of reinforcement learning over many levels, on one core and on all"),
     "training": ("benchmarks.training", "env steps/s of rollout, update, and the program that does both"),
     "networks": (
         "benchmarks.networks",

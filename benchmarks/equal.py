@@ -29,6 +29,7 @@ from levelproof.pipeline.store.provenance import device
 
 FINISHED = Path(__file__).parent / "results" / "equal"  # a file for each finished run
 POINTS = 100  # of its curve
+LOOKS = 0.25, 0.5, 1.0  # shares of the core-seconds after which a policy is measured
 FIRST = 50_000  # id of the first level to clone from; the measured ones are sealed
 BETWEEN_SEEDS = 10_000_000  # ids
 LARGE = ("ppo.environments=2048", "ppo.epochs=2")  # fewer, larger steps than the defaults'
@@ -126,9 +127,11 @@ def run(args: argparse.Namespace) -> Report:
             f"of 8 attempts at them: the {players[SOLVED]['random']['levels']:,} that are labelled solved.",
             *dict.fromkeys(each["remark"] for each in results if "remark" in each),
             *(f"{way}: `levelproof train {words_of(args, way, 0)}{started(way)}`." for way in args.ways),
-            f"![Share of episodes that reach the goal in training, against core-seconds]({PLOT})",
-            "The plot has the weights as they act, in random levels never played before, or in the levels that a way "
-            "trains on; the table measures the average of the weights, which is what is saved, in sealed levels.",
+            f"![Shares that reach the goal, in training and of sealed levels, against core-seconds]({PLOT})",
+            "On the left, episodes of training: of the weights as they act, in random levels never played before, or "
+            "in the levels that a way trains on. On the right, as in the table, the sealed levels labelled solved that "
+            "the average of the weights solves, which is what is saved; a first point is the clone. Some runs were "
+            "measured at their end alone.",
         ],
         plots={PLOT: partial(draw, results)},
         made=f"{' to '.join(dict.fromkeys((dates[0], dates[-1])))}, on the processors in the table",
@@ -173,11 +176,16 @@ def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
     elif WAYS[way].own_levels:
         with SEARCHING:
             before = searched(args, seed)
-    curve = trained(args, folder, way, start, seed, args.core_seconds - before)
-    rates = kept(args.folder / f"{folder.name}-{curve[-1][STEPS]}-{args.measured}.json", folder, *measuring(args))
+    ends, looks, curve, rates = [share * args.core_seconds for share in LOOKS], [], [], {}
+    if before >= ends[-1]:
+        raise UserError(f"{way}: what comes before training takes {before:,.0f} core-seconds: raise --core-seconds.")
+    for spent in (end for end in ends if end > before):
+        curve = trained(args, folder, way, start, seed, spent - before)
+        rates = kept(args.folder / f"{folder.name}-{curve[-1][STEPS]}-{args.measured}.json", folder, *measuring(args))
+        looks.append({SECONDS: before + curve[-1][SECONDS], "solved": rates[SOLVED][SAMPLED]["once"]})
     lines = [*curve[:: -(-len(curve) // POINTS)], curve[-1]]
     some = [{name: line.get(name) for name in (UPDATES, STEPS, SECONDS, RATE)} for line in lines]
-    return {"before": before, "curve": some, "sealed": rates, "cloned": clone}
+    return {"before": before, "curve": some, "looks": looks, "sealed": rates, "cloned": clone}
 
 
 def measuring(args: argparse.Namespace) -> Sequence[Any]:
@@ -270,20 +278,32 @@ def row_of(name: str, cost: Sequence[str], rates: Mapping[str, Any], player: str
 
 
 def draw(results: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Plot the solve rate of training against all core-seconds, those before training included."""
+    """Plot solve rates, in training and of sealed levels, against all core-seconds, those before training included."""
     plt = pyplot()
-    figure, axes = plt.subplots(figsize=(6, 3.5), layout="constrained")
+    figure, (training, sealed) = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained", sharex=True, sharey=True)
     labelled = set[str]()  # ways in the legend
     for each in results:
-        curve = [line for line in each["curve"] if line[UPDATES] > SETTLED]
-        points = [(each["before"] + line[SECONDS], 100 * line[RATE]) for line in curve if line.get(RATE)]
-        if not points:
-            continue
-        label = None if each["way"] in labelled else each["way"]
+        curve = [line for line in each["curve"] if line[UPDATES] > SETTLED and line.get(RATE)]
+        colour, label = WAYS[each["way"]].colour, None if each["way"] in labelled else each["way"]
         labelled.add(each["way"])
-        axes.plot(*zip(*points, strict=True), color=WAYS[each["way"]].colour, label=label, linewidth=1)
-    axes.set(xlim=(0, None), xlabel="core-seconds", ylabel="episodes that reach the goal, %")
-    axes.legend(frameon=False, loc="lower right")
-    axes.spines[["top", "right"]].set_visible(False)
+        training.plot(
+            [each["before"] + line[SECONDS] for line in curve], [100 * line[RATE] for line in curve], color=colour, lw=1
+        )
+        seconds, rates = zip(*looks_of(each), strict=True)
+        sealed.plot(seconds, [100 * rate for rate in rates], color=colour, label=label, lw=1, marker="o", markersize=3)
+    training.set(xlim=(0, None), xlabel="core-seconds", ylabel="reach the goal, %", title="episodes of training")
+    sealed.set(xlabel="core-seconds", title="sealed levels labelled solved")
+    sealed.legend(frameon=False, loc="lower right", fontsize="small")
+    for axes in (training, sealed):
+        axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, metadata={"Date": None})
     plt.close(figure)
+
+
+def looks_of(each: Mapping[str, Any]) -> list[tuple[float, float]]:
+    """Return core-seconds and shares of the solved sealed levels: of the clone, if there is one, and of the policy."""
+    rate = lambda rates: rates[SOLVED][SAMPLED]["once"]["rate"]
+    clone = [(each["before"], rate(each["cloned"]))] if each["cloned"] else []
+    end = [(each["before"] + each["curve"][-1][SECONDS], rate(each["sealed"]))]
+    looks = [(look[SECONDS], look["solved"]["rate"]) for look in each.get("looks", [])]
+    return clone + (looks or end)

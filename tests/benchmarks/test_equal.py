@@ -46,6 +46,11 @@ def test_ways_end_at_the_same_core_seconds(tmp_path: Path) -> None:
     for each in report.results:
         first, last = each["curve"][0][SECONDS], each["curve"][-1][SECONDS]
         assert 200 - 2 * first - 10 < each["before"] + last < 210, "all stop where more would exceed the limit"
+        spent = [look[SECONDS] for look in each["looks"]]
+        assert spent == sorted(spent)
+        assert spent[-1] == each["before"] + last
+        assert each["looks"][-1]["solved"] == each["sealed"]["labelled solved"]["policy, sampled"]["once"]
+    assert len(scratch["looks"]) == 3, "at a quarter, at half and at the end"
     for name, draw in report.plots.items():
         draw(tmp_path / name)
         assert (tmp_path / name).read_text().rstrip().endswith("</svg>")
