@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> Report:
             files = [*threads.map(lambda one: finished(args, *one), runs)]
     if not files:
         raise UserError(f"--only-finished: {args.finished} has none of these runs; without it they are made.")
-    results = [json.loads(file.read_text()) for file in files]
+    results = sorted((json.loads(file.read_text()) for file in files), key=lambda each: each["device"])
     players, dates = results[0]["sealed"], sorted(each["date"][:10] for each in results)
     rows = [list(row) for row in dict.fromkeys(tuple(row) for each in results for row in rows_of(each))]
     rows += [row_of(name, ("", "", "", "", ""), players, name) for name in PLAYERS if name in players[ALL]]
