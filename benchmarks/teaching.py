@@ -98,20 +98,22 @@ def notes(args: argparse.Namespace, players: Mapping[str, Any]) -> list[str]:
     """Say what is compared, and how."""
     settings = f", with {' '.join(f'`{setting}`' for setting in args.set)}" if args.set else ""
     at_cost = (
-        f" In the second, the witnesses of each kind cost about {args.cost:,.0f} core-seconds, with ids from there on, "
-        f"and policies take {args.cost_updates:,} updates on all of them; what teachers and experts then play counts "
+        f" At the same cost: the witnesses of each kind cost about {args.cost:,.0f} core-seconds, with ids from there "
+        f"on, and policies take {args.cost_updates:,} updates on all of them; what teachers and experts then play counts "
         "as training."
+        if args.cost
+        else ""
     )
     procedures = dict.fromkeys(map(procedure_of, args.data))
     return [
-        "In the first table, all policies learn from the same levels, those that every procedure solves of the "
-        f"{args.levels:,} ids from {FIRST:,} on, in {args.updates:,} updates{settings}.{at_cost if args.cost else ''} "
-        f"Random actions solve {interval_text(players['random']['once'])} of the "
-        f"{players['random']['levels']:,} sealed levels.",
+        f"On the same levels: all policies learn from those that every procedure solves of the {args.levels:,} ids "
+        f"from {FIRST:,} on, in {args.updates:,} updates{settings}.{at_cost} Of the {players['random']['levels']:,} "
+        f"sealed levels, random actions solve {interval_text(players['random']['once'])}, sticky random actions "
+        f"{interval_text(players['sticky random']['once'])}.",
         "; ".join(f"*{name}*: `levelproof generate {' '.join(DATA[name])}`" for name in procedures) + ".",
         *(about(name) for name in args.data if name in DISTILLED),
         "Core-seconds are CPU seconds, compiling included: of data those of the whole command, unsolved levels "
-        "included (in the first table of all its ids); of training those of all its commands, teachers and experts "
+        "included (for the same levels those of all ids); of training those of all its commands, teachers and experts "
         "included. Steps to the goal: the mean of the witnesses. Clones keep a tenth of their levels for validation, "
         "`distill` learns from all.",
     ]
