@@ -99,8 +99,8 @@ def notes(args: argparse.Namespace, players: Mapping[str, Any]) -> list[str]:
     settings = f", with {' '.join(f'`{setting}`' for setting in args.set)}" if args.set else ""
     at_cost = (
         f" At the same cost: the witnesses of each kind cost about {args.cost:,.0f} core-seconds, with ids from there "
-        f"on, and policies take {args.cost_updates:,} updates on all of them; what teachers and experts then play counts "
-        "as training."
+        f"on, and policies take {args.cost_updates:,} updates on all of them; what teachers and experts then play "
+        "counts as training."
         if args.cost
         else ""
     )
