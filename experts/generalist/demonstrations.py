@@ -1,7 +1,7 @@
 """Demonstrations: what experts choose in episodes with noise (DART, Laskey et al. 2017, arXiv:1703.09327).
 
 A witness shows one way to the goal and no mistake. Here the level's expert plays again, while the action executed last
-sometimes replaces the one it chooses, or bodies start with other velocities. So it leaves its way, and shows how it
+sometimes replaces the one it chooses, or bodies start with other velocities. So it leaves its path, and shows how it
 returns: what is learned in a state is the action that it chose there, executed or not. The strength of the noise is
 fixed; DART fits it to the learner's errors.
 """
