@@ -42,7 +42,8 @@ def wheel(sdist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The wheel of the unpacked source distribution, as package indexes and `pip install FILE` build it."""
     folder = tmp_path_factory.mktemp("wheel")
     with tarfile.open(sdist) as file:
-        file.extractall(folder, filter="data")
+        file.extraction_filter = getattr(tarfile, "data_filter", None)  # missing before Python 3.11.4
+        file.extractall(folder)
     return build(folder / sdist.name.removesuffix(".tar.gz"), "wheel", folder)
 
 

@@ -21,7 +21,8 @@ from tests.pipeline.command import assert_refused, here
 @pytest.fixture
 def older(tmp_path: Path) -> Path:
     with tarfile.open(HERE / "sampler-1.tar.xz") as archive:
-        archive.extractall(tmp_path / "16k", filter="data")
+        archive.extraction_filter = getattr(tarfile, "data_filter", None)  # missing before Python 3.11.4
+        archive.extractall(tmp_path / "16k")
     return tmp_path / "16k" / "s"
 
 
