@@ -4,9 +4,11 @@ import json
 from collections.abc import Mapping
 from dataclasses import is_dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
+import pytest
 from safetensors.numpy import load_file
 
 from levelproof.configs.compose import override_of
@@ -26,6 +28,17 @@ def assert_average_is_kept(out: Path, average: str, last: str) -> None:
     for name, values in weights.items():
         np.testing.assert_array_equal(values, kept[average + name])
     assert any((values != kept[last + name]).any() for name, values in weights.items())
+
+
+def stop_after_saving(monkeypatch: pytest.MonkeyPatch, command: ModuleType) -> None:
+    """Let the learner of this module be stopped, as by Ctrl-C, once it has saved a checkpoint."""
+    keep = command.keep_run
+
+    def stopped(*arguments: Any) -> None:
+        keep(*arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "keep_run", stopped)
 
 
 def assert_guide_lists(settings: Mapping[str, Any], *pages: str) -> None:

@@ -26,7 +26,7 @@ from levelproof.pipeline.learn.pool import LevelPool
 from levelproof.pipeline.store.checkpoints import begun_like, save_experts
 from levelproof.pipeline.store.layout import EXPERTS
 from tests.pipeline.command import assert_refused, here
-from tests.pipeline.learn.runs import assert_average_is_kept, assert_guide_lists, metrics
+from tests.pipeline.learn.runs import assert_average_is_kept, assert_guide_lists, metrics, stop_after_saving
 from tests.pipeline.made import made_job
 
 TINY = ("network.width=8", "network.depth=1", "network.heads=1")
@@ -35,9 +35,9 @@ TEACHERS = ("teachers.witness=2", "teachers.random=8", "teachers.learner=1")
 FILES = ("policy.safetensors", "checkpoint.safetensors", "config.json")
 
 
-def distilled(folder: Path, split: Path, *words: str) -> Path:
+def distilled(folder: Path, split: Path, *words: str, teachers: tuple[str, ...] = TEACHERS) -> Path:
     folder.mkdir(exist_ok=True)
-    done = here(["distill", str(split), "-o", "policy", *ROUNDS, *TEACHERS, *words], folder)
+    done = here(["distill", str(split), "-o", "policy", *ROUNDS, *teachers, *words], folder)
     assert done.returncode == 0, done.stderr
     return folder / "policy"
 
@@ -68,17 +68,12 @@ def test_kept_experts_of_a_split_label_states_and_demonstrate(tmp_path: Path, mo
     assert sum(line["distill/by_expert"] for line in metrics(out)) > 0
     added = load_file(out / "checkpoint.safetensors")[".labels.added"]
     out.rename(tmp_path / "both")
-    alone = "states=0", *TINY, *shown
-    keep = module.keep_run
-
-    def stopped(*arguments: Any) -> None:
-        keep(*arguments)
-        raise KeyboardInterrupt
-
+    split, alone = tmp_path / "data/5k/s", ("states=0", *TINY, *shown)
     with monkeypatch.context() as patch:
-        patch.setattr(module, "keep_run", stopped)
-        here(["distill", "data/5k/s", "-o", "policy", *ROUNDS, *alone], tmp_path)
-    out = shown_alone(tmp_path, *alone)
+        stop_after_saving(patch, module)
+        here(["distill", str(split), "-o", "policy", *ROUNDS, *alone], tmp_path)
+    assert load_file(tmp_path / "policy/checkpoint.safetensors")[".imitation.updates"] == 2
+    out = distilled(tmp_path, split, *alone, teachers=())
     weights = (out / "policy.safetensors").read_bytes()
     for line in metrics(out):
         assert line["distill/asked"] == line["distill/none"] == 0
@@ -86,13 +81,8 @@ def test_kept_experts_of_a_split_label_states_and_demonstrate(tmp_path: Path, mo
         assert 0 < line["distill/demonstrated"] <= 1
     assert 0 < load_file(out / "checkpoint.safetensors")[".labels.added"] < added
     out.rename(tmp_path / "stopped")
-    assert (shown_alone(tmp_path, *alone) / "policy.safetensors").read_bytes() == weights
-
-
-def shown_alone(folder: Path, *words: str) -> Path:
-    done = here(["distill", "data/5k/s", "-o", "policy", *ROUNDS, *words], folder)
-    assert done.returncode == 0, done.stderr
-    return folder / "policy"
+    again = distilled(tmp_path, split, *alone, teachers=())
+    assert (again / "policy.safetensors").read_bytes() == weights
 
 
 def test_levels_without_an_expert_are_not_demonstrated(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,13 +122,7 @@ def test_folder_holds_a_policy_with_its_origin(policy: Path, split: Path) -> Non
 def test_run_that_was_stopped_continues_bit_for_bit(
     policy: Path, split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    keep = module.keep_run
-
-    def stopped(*arguments: Any) -> None:
-        keep(*arguments)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(module, "keep_run", stopped)
+    stop_after_saving(monkeypatch, module)
     here(["distill", str(split), "-o", "policy", *ROUNDS, *TEACHERS, *TINY], tmp_path)
     assert load_file(tmp_path / "policy/checkpoint.safetensors")[".imitation.updates"] == 2
     monkeypatch.undo()

@@ -22,7 +22,7 @@ from levelproof.pipeline.learn.folder import weights_digest
 from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.trained_on import levels_for
 from tests.pipeline.command import assert_refused, here
-from tests.pipeline.learn.runs import assert_average_is_kept, assert_guide_lists, metrics
+from tests.pipeline.learn.runs import assert_average_is_kept, assert_guide_lists, metrics, stop_after_saving
 
 LANES = (
     "ppo.environments=64",
@@ -123,13 +123,8 @@ def test_stopped_run_with_edited_levels_continues_bit_for_bit(tmp_path: Path, mo
 def continues_bit_for_bit(words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     words = ("interval=2", *words)
     whole = trained(tmp_path / "whole", 4, *words)
-    keep, made = module.keep_run, programs.cache_info().misses
-
-    def stopped(*arguments: Any) -> None:
-        keep(*arguments)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(module, "keep_run", stopped)
+    made = programs.cache_info().misses
+    stop_after_saving(monkeypatch, module)
     (tmp_path / "stopped").mkdir()
     here(["train", "-o", "agent", f"ppo.env_steps={4 * PER_UPDATE}", *LANES, *words], tmp_path / "stopped")
     assert load_file(tmp_path / "stopped/agent/checkpoint.safetensors")[".updates"] == 2
