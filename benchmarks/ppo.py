@@ -13,7 +13,7 @@ from levelproof.levelgen.level import SIZES
 from levelproof.pipeline.runtime import own_cores
 
 RATE, STEPS = "train/env_steps_per_second", "train/env_steps"
-LIKE_THE_PILOT = ("ppo.environments=512", "ppo.horizon=64", "ppo.epochs=2")
+SETTINGS = ("ppo.environments=512", "ppo.horizon=64", "ppo.epochs=2")
 
 
 def register(parser: argparse.ArgumentParser) -> None:
@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> Report:
     results = [measured(args, size, cores) for size in args.sizes for cores in every]
     rows = [[each["size"], str(each["cores"]), f"{each['rate']:,.0f}", f"{each['env_steps']:,}"] for each in results]
     table = Table(("size", "cores", "env steps/s", "env steps"), rows, "Env steps/s of PPO over fresh random levels")
-    words = " ".join((*LIKE_THE_PILOT, *args.set))
+    words = " ".join((*SETTINGS, *args.set))
     return Report(
         "Reinforcement learning: env steps/s",
         results,
@@ -37,9 +37,7 @@ def run(args: argparse.Namespace) -> Report:
         [
             f"`levelproof train {words}`, with the default network unless a setting changes it ({network.depth} blocks "
             f"of {network.kind}, width {network.width}). The rate is that of the clock, of all updates but the first; "
-            "compiling and writing checkpoints do not count. The pilot that this was planned by, a plain PPO of forty "
-            "lines with a network of this size and these settings, ran at 13,700 env steps/s on two cores, of another "
-            "machine.",
+            "compiling and writing checkpoints do not count.",
         ],
     )
 
@@ -48,6 +46,6 @@ def measured(args: argparse.Namespace, size: str, cores: int) -> dict[str, Any]:
     """Train one policy, and return its rate."""
     policy = args.folder / f"{size}-{cores}"
     steps = f"ppo.env_steps={args.env_steps}"
-    command("train", f"size={size}", f"cores={cores}", steps, *LIKE_THE_PILOT, *args.set, "-o", policy)
+    command("train", f"size={size}", f"cores={cores}", steps, *SETTINGS, *args.set, "-o", policy)
     last = lines_of(policy)[-1]
     return {"size": size, "cores": cores, "rate": last.get(RATE, np.nan), "env_steps": int(last[STEPS])}

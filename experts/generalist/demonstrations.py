@@ -27,16 +27,6 @@ from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.rules import TaskParams, TaskState
 
 
-class _Demonstrating(NamedTuple):
-    """Episodes under way; a step's action and motion are written before it."""
-
-    step: Int[Array, ""]
-    now: TaskState
-    executed: Int[Array, "6 episode"]
-    ended: Bool[Array, " episode"]
-    shown: "Demonstrations"
-
-
 class Demonstrations(NamedTuple):
     """First episodes of experts."""
 
@@ -44,6 +34,16 @@ class Demonstrations(NamedTuple):
     action: Int8[Array, "256 6 episode"]  # that the expert chose; meaningless after `length`
     motion: Float[Array, "256 episode column"]  # before each action (`experts.imitation.Transitions`)
     env_steps: Int[Array, " episode"]  # until the episode's end
+
+
+class _Demonstrating(NamedTuple):
+    """Episodes under way; a step's action and motion are written before it."""
+
+    step: Int[Array, ""]
+    now: TaskState
+    executed: Int[Array, "6 episode"]
+    ended: Bool[Array, " episode"]
+    shown: Demonstrations
 
 
 @partial(jax.jit, static_argnames=("config", "contacts", "rules"))
