@@ -42,6 +42,7 @@ OFTEN = (  # the defaults measure four times in 50 million env steps, and keep 2
     "curriculum.keep=1536",
     "curriculum.share=0.75",
 )
+EVERY = "ppo.repeat=1"  # an action in every env step, as policies play
 PLOT = "equal.svg"
 UPDATES = "train/updates"
 SETTLED = 5  # updates, after which lines no longer favour short episodes
@@ -69,7 +70,9 @@ SEARCHING = Lock()  # several ways share levels and a clone
 WAYS = {
     "from scratch": Way(SCRATCH, colour="#0072b2"),
     "from scratch, by default": Way(("network.width=64",), colour="#332288"),
+    "from scratch, repeat=1": Way((*SCRATCH, EVERY), colour="#88aacc"),
     "from scratch, learnability": Way((*SCRATCH, "levels=learnability"), colour="#56b4e9"),
+    "from scratch, learnability, repeat=1": Way((*SCRATCH, "levels=learnability", EVERY), colour="#bbddee"),
     "from scratch, learnability measured often": Way((*SCRATCH, "levels=learnability", *OFTEN), colour="#44aa99"),
     "from scratch, replay": Way((*SCRATCH, "levels=replay"), colour="#117733"),
     "from scratch, evolve": Way((*SCRATCH, "levels=evolve"), colour="#882255"),
@@ -79,6 +82,9 @@ WAYS = {
     "levels, clone, reinforcement on these levels": Way(TUNING, CLONE, "#cc79a7", own_levels=True),
     "levels, clone, learnability on these levels": Way(
         (*TUNING, "choice=learnability", *OFTEN), CLONE, "#999933", own_levels=True
+    ),
+    "levels, clone, learnability on these levels, repeat=1": Way(
+        (*TUNING, "choice=learnability", *OFTEN, EVERY), CLONE, "#cccc88", own_levels=True
     ),
     "levels, clone, teachers, reinforcement on these levels": Way(
         TUNING, CLONE, "#661100", own_levels=True, teachers=True
@@ -268,7 +274,8 @@ def rows_of(each: Mapping[str, Any]) -> list[list[str]]:
     last, rows, run = each["curve"][-1], [], (str(each["seed"]), each["device"].removeprefix("cpu: "))
     if each["cloned"]:
         cost = *run, "0", "", f"{each['before']:,.0f}"
-        rows.append(row_of(each["way"].rpartition(", ")[0], cost, each["cloned"]))
+        name = "levels, clone, teachers" if WAYS[each["way"]].teachers else "levels, clone"
+        rows.append(row_of(name, cost, each["cloned"]))
     cost = *run, f"{last[STEPS]:,}", f"{each['before']:,.0f}", f"{each['before'] + last[SECONDS]:,.0f}"
     return [*rows, row_of(each["way"], cost, each["sealed"])]
 

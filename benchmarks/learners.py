@@ -4,6 +4,7 @@ A stopped run resumes: `levelproof train` resumes from its checkpoint, and the f
 """
 
 import argparse
+import re
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -89,7 +90,7 @@ def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
 
 def slug(name: str) -> str:
     """Return a name as the files and folders of a benchmark have it."""
-    return name.replace(", ", "-").replace(" ", "-").replace(":", "-")
+    return re.sub("[ :,=]+", "-", name)
 
 
 def evaluated(args: argparse.Namespace, file: Path, policy: Path | str) -> dict[str, Any]:

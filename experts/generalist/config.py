@@ -2,9 +2,9 @@
 
 import math
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from levelproof.levelgen.task.rules import MAX_REWARD_SCALE
+from levelproof.levelgen.task.rules import MAX_REWARD_SCALE, TaskParams
 from levelproof.physics.bounds import require
 
 CHUNK = 256  # lanes that go through the network together: their activations fit a core's cache
@@ -14,9 +14,10 @@ CHUNK = 256  # lanes that go through the network together: their activations fit
 class PPOConfig:
     """Hyperparameters of training (hashable: pass as a static argument)."""
 
-    env_steps: int = 20_000_000  # env steps of all lanes; training ends with the update that reaches them
+    env_steps: int = 80_000_000  # env steps of all lanes; training ends with the update that reaches them
     environments: int = 512  # lanes, divided evenly among the cores
-    horizon: int = 64  # env steps in each lane between updates
+    horizon: int = 64  # actions in each lane between updates
+    repeat: int = 4  # env steps that each action lasts in training; a policy that plays acts in every one
     dense_reward_scale: float = 0.2  # 1/m; shaping reward in training, in place of the task's
     epochs: int = 4  # passes over the samples of an update
     minibatches: int = 32  # updates of the weights in an epoch
@@ -24,7 +25,7 @@ class PPOConfig:
     adam_epsilon: float = 1e-5  # Adam's epsilon
     max_gradient_norm: float = 1.0  # maximum global norm of the gradient
     discount: float = 0.995  # discount factor of rewards, per env step
-    gae_lambda: float = 0.97  # lambda of advantage estimates (Schulman et al. 2016, arXiv:1506.02438)
+    gae_lambda: float = 0.97  # lambda of advantage estimates, per action (Schulman et al. 2016, arXiv:1506.02438)
     clip: float = 0.2  # maximum change of the probability ratio, and of the value, in either direction
     value_weight: float = 0.5  # weight of the value function's loss
     entropy_weight: float = 0.01  # weight of the policy's entropy, a bonus in the loss
@@ -35,7 +36,7 @@ class PPOConfig:
     kl_updates: int = 60  # updates after the critic's over which the penalty falls to 0
 
     def __post_init__(self) -> None:
-        require(self, ("env_steps", "environments", "horizon", "epochs", "minibatches"), 1)
+        require(self, ("env_steps", "environments", "horizon", "repeat", "epochs", "minibatches"), 1)
         require(self, ("learning_rate", "adam_epsilon", "max_gradient_norm"), 0, above=True)
         require(self, ("discount", "gae_lambda", "clip", "average"), 0, 1)
         require(self, ("value_weight", "entropy_weight", "kl_weight"), 0)
@@ -45,12 +46,25 @@ class PPOConfig:
     @property
     def steps_per_update(self) -> int:
         """Env steps of all lanes per update."""
-        return self.environments * self.horizon
+        return self.environments * self.horizon * self.repeat
 
     @property
     def updates(self) -> int:
         """Updates in `env_steps`."""
         return -(-self.env_steps // self.steps_per_update)
+
+    def training_rules(self, rules: TaskParams) -> TaskParams:
+        """Return the rules of training: those of the task, with this shaping reward, an action per `repeat` env steps.
+
+        Goal and red are still looked for after every physics step, so what ends an episode stays the same; only the
+        time limit is rounded up to a whole number of actions.
+        """
+        return replace(
+            rules,
+            dense_reward_scale=self.dense_reward_scale,
+            frame_skip=rules.frame_skip * self.repeat,
+            max_timesteps=-(-rules.max_timesteps // self.repeat),
+        )
 
     def shares_out(self, cores: int) -> bool:
         """Whether this number of cores divides the lanes evenly, and minibatches the chunks of a core."""

@@ -86,7 +86,7 @@ def rollout(
     steps: int,
     rules: TaskParams,
 ) -> tuple[Playing, Experience, Ended]:
-    """Act for `steps` env steps in every lane.
+    """Take `steps` actions in every lane, each as long as `rules` say.
 
     Args:
         params: the policy and its value function.
@@ -95,7 +95,7 @@ def rollout(
         playing: episodes under way.
         draw: chooses the level that each lane plays next, if its episode ends.
         key: consumed.
-        steps: env steps in each lane.
+        steps: actions in each lane.
         rules: the task's rules, with the reward that is learned from.
 
     Returns:

@@ -52,7 +52,7 @@ class UpdateFacts(NamedTuple):
 
     episodes: Int[Array, ""]  # that ended
     solved: Int[Array, ""]  # of them
-    env_steps: Int[Array, ""]  # of them
+    actions: Int[Array, ""]  # of them
     reward: Float[Array, ""]  # sum over them, shaping included
     entropy: Float[Array, ""]  # of the policy's live entries, nats; this and what follows are means over samples
     value_error: Float[Array, ""]
@@ -67,7 +67,7 @@ class TrainingRecipe(NamedTuple):
     size: Size
     ppo: PPOConfig
     curriculum: Curriculum
-    rules: TaskParams  # with the reward that is learned from
+    rules: TaskParams  # of training: `PPOConfig.training_rules`
     seed: int
 
 
@@ -190,7 +190,8 @@ def _advantages(experience: Experience, config: PPOConfig) -> Float[Array, "time
     open_ended = _open_ended(experience)
     reward = jnp.where(open_ended, experience.value, experience.reward)
     over = experience.done | open_ended
-    return advantages(experience.value, reward, over, jnp.zeros_like(reward[0]), config)
+    per_action = replace(config, discount=config.discount**config.repeat)
+    return advantages(experience.value, reward, over, jnp.zeros_like(reward[0]), per_action)
 
 
 def _chunks(recipe: TrainingRecipe, experience: Experience, start: VariableDict | None, update: Array) -> Chunk:
@@ -291,6 +292,7 @@ def _measure(recipe: TrainingRecipe, learner: Learner, table: Table) -> Learner:
     def attempt(level_index: Int[Array, " level"], steps: int, key: Key[Array, ""]) -> tuple[Array, Array]:
         cores, core = jax.lax.axis_size(CORES), jax.lax.axis_index(CORES)
         own = jnp.resize(level_index, (-(-len(level_index) // cores) * cores,)).reshape(cores, -1)[core]
+        actions = -(-steps // recipe.ppo.repeat)
         parts = jnp.resize(own, (-(-len(own) // CHUNK), min(CHUNK, len(own))))
 
         def play(given: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -298,7 +300,7 @@ def _measure(recipe: TrainingRecipe, learner: Learner, table: Table) -> Learner:
             again = lambda key, lanes: part
             now = begin(table, part, recipe.rules)
             each = jax.random.fold_in(key, core * len(parts) + number)
-            _, _, ended = rollout(learner.params, recipe.network, table, now, again, each, steps, recipe.rules)
+            _, _, ended = rollout(learner.params, recipe.network, table, now, again, each, actions, recipe.rules)
             return ended.done.sum(0), (ended.done & ended.goal).sum(0)
 
         counts = jax.tree.map(lambda x: x.reshape(-1)[: len(own)], jax.lax.map(play, (jnp.arange(len(parts)), parts)))

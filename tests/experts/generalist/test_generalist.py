@@ -18,11 +18,12 @@ from levelproof.experts.optimise import running_average
 from levelproof.experts.policy import divergence, log_probability
 from levelproof.levelgen.level import ACTIONS
 from levelproof.levelgen.sampling.sampler import sample_levels, sampler
+from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.learn.sealed import SEALED
 
-CONFIG = PPOConfig(discount=0.9, gae_lambda=0.8)
+CONFIG = PPOConfig(repeat=1, discount=0.9, gae_lambda=0.8)
 
 
 def experience(done: list[bool], terminated: list[bool]) -> Experience:
@@ -43,6 +44,37 @@ def test_truncated_episode_bootstraps_and_terminated_one_does_not() -> None:
     assert _open_ended(experience([False, True, True], [False, False, True]))[:, 0].tolist() == [False, True, False]
     assert _open_ended(experience([False, True, False], [False, True, False]))[:, 0].tolist() == [False, False, True]
     np.testing.assert_allclose(last, [1 + 0.9 * 20 - 10 + 0.72 * (2 + 0.9 * 30 - 20), 2 + 0.9 * 30 - 20, 0], rtol=1e-6)
+
+
+def test_discount_counts_env_steps_whatever_an_action_lasts() -> None:
+    lane = experience([False, False, True], [False, False, True])
+    longer = replace(CONFIG, repeat=2, discount=0.9**0.5)
+    np.testing.assert_allclose(_advantages(lane, longer), _advantages(lane, CONFIG), rtol=1e-6)
+
+
+@pytest.mark.parametrize("repeat", [1, 3])
+def test_repeated_action_does_what_as_many_env_steps_do(repeat: int) -> None:
+    """The same world, and the same reward after the first action, whose shaping is 0; the same lanes end."""
+    config = PPOConfig(repeat=repeat, dense_reward_scale=0.3)
+    once, whole = config.training_rules(DEFAULT_RULES), replace(config, repeat=1).training_rules(DEFAULT_RULES)
+    assert once.max_timesteps == -(-256 // repeat)
+    levels = sample_levels(np.arange(64), "s")
+    one = several = task.reset(levels)
+    over, reward, goal = np.zeros(64, bool), np.zeros(64), np.zeros(64, bool)
+    for turn in range(12):
+        action = jax.random.randint(jax.random.key(turn), (ACTIONS, 64), 0, 2)
+        before, (one, result) = over, task.advance(levels, one, action, once)
+        for _ in range(repeat):
+            several, each = task.advance(levels, several, action, whole)
+            reward, goal = reward + np.where(over, 0, each.reward), goal | (~over & np.asarray(each.goal))
+            over = over | np.asarray(each.done)
+        np.testing.assert_array_equal(over, before | np.asarray(result.done))
+        reward = np.where(turn > 0, reward - np.where(before, 0, result.reward), 0)
+        goal ^= ~before & np.asarray(result.goal)
+        np.testing.assert_array_equal(one.state.position[..., ~over], several.state.position[..., ~over])
+    assert 0 < over.sum() < 64
+    np.testing.assert_allclose(reward, 0, atol=1e-5)
+    assert not goal.any()
 
 
 def test_shares_of_a_minibatch_are_normalised_together() -> None:

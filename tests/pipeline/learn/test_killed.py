@@ -18,7 +18,7 @@ RUNS = {
     ),
     "train": (
         "levels=SPLIT", "where=label = 'solved'", "interval=1", "cores=2", "ppo.environments=64", "ppo.minibatches=4",
-        "ppo.horizon=32", f"ppo.env_steps={10 * 64 * 32}",
+        "ppo.horizon=32", f"ppo.env_steps={10 * 64 * 32}", "ppo.repeat=1",
     ),
     "distill": (
         "SPLIT", "interval=2", "train.updates=20", "train.batch=32", "episodes=8", "states=16", "buffer=64",

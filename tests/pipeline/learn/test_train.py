@@ -33,7 +33,7 @@ LANES = (
     "cores=1",
 )
 TINY = ("network.width=8", "network.depth=1", "network.heads=1")
-PER_UPDATE = 64 * 32
+PER_UPDATE = 64 * 32 * PPOConfig().repeat
 FILES = ("policy.safetensors", "checkpoint.safetensors", "config.json")
 
 
