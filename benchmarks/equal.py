@@ -32,17 +32,9 @@ POINTS = 100  # of its curve
 LOOKS = 0.25, 0.5, 1.0  # shares of the core-seconds after which a policy is measured
 FIRST = 50_000  # id of the first level to clone from; the measured ones are sealed
 BETWEEN_SEEDS = 10_000_000  # ids
-LARGE = ("ppo.environments=2048", "ppo.epochs=2")  # fewer, larger steps than the defaults'
-SCRATCH = (*LARGE, "ppo.learning_rate=3e-4", "ppo.entropy_weight=0.005", "network.width=64")
-TUNING = (*LARGE, "ppo.learning_rate=2e-4", "ppo.entropy_weight=0.002", "ppo.critic_updates=5")
-OFTEN = (  # the defaults measure four times in 50 million env steps, and keep 256 levels for 2,048 lanes
-    "curriculum.every=16",
-    "curriculum.candidates=4096",
-    "curriculum.measured_steps=512",
-    "curriculum.keep=1536",
-    "curriculum.share=0.75",
-)
-EVERY = "ppo.repeat=1"  # an action in every env step, as policies play
+SCRATCH = ("network.width=64",)
+SHORT = "ppo.repeat=1"  # actions of one env step in training, too
+TUNING = ("ppo.learning_rate=2e-4", "ppo.entropy_weight=0.002", "ppo.critic_updates=5")
 PLOT = "equal.svg"
 UPDATES = "train/updates"
 SETTLED = 5  # updates, after which lines no longer favour short episodes
@@ -69,11 +61,8 @@ class Way(NamedTuple):
 SEARCHING = Lock()  # several ways share levels and a clone
 WAYS = {
     "from scratch": Way(SCRATCH, colour="#0072b2"),
-    "from scratch, by default": Way(("network.width=64",), colour="#332288"),
-    "from scratch, repeat=1": Way((*SCRATCH, EVERY), colour="#88aacc"),
+    "from scratch, short actions": Way((*SCRATCH, "ppo.learning_rate=3e-4", SHORT), colour="#99bbdd"),
     "from scratch, learnability": Way((*SCRATCH, "levels=learnability"), colour="#56b4e9"),
-    "from scratch, learnability, repeat=1": Way((*SCRATCH, "levels=learnability", EVERY), colour="#bbddee"),
-    "from scratch, learnability measured often": Way((*SCRATCH, "levels=learnability", *OFTEN), colour="#44aa99"),
     "from scratch, replay": Way((*SCRATCH, "levels=replay"), colour="#117733"),
     "from scratch, evolve": Way((*SCRATCH, "levels=evolve"), colour="#882255"),
     "levels, reinforcement on these levels": Way(SCRATCH, colour="#000000", own_levels=True),
@@ -81,10 +70,10 @@ WAYS = {
     "levels, clone, learnability": Way((*TUNING, "levels=learnability"), CLONE, "#e69f00"),
     "levels, clone, reinforcement on these levels": Way(TUNING, CLONE, "#cc79a7", own_levels=True),
     "levels, clone, learnability on these levels": Way(
-        (*TUNING, "choice=learnability", *OFTEN), CLONE, "#999933", own_levels=True
+        (*TUNING, "choice=learnability"), CLONE, "#999933", own_levels=True
     ),
-    "levels, clone, learnability on these levels, repeat=1": Way(
-        (*TUNING, "choice=learnability", *OFTEN, EVERY), CLONE, "#cccc88", own_levels=True
+    "levels, clone, learnability on these levels, short actions": Way(
+        (*TUNING, "choice=learnability", SHORT), CLONE, "#cccc88", own_levels=True
     ),
     "levels, clone, teachers, reinforcement on these levels": Way(
         TUNING, CLONE, "#661100", own_levels=True, teachers=True

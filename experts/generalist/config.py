@@ -15,20 +15,20 @@ class PPOConfig:
     """Hyperparameters of training (hashable: pass as a static argument)."""
 
     env_steps: int = 80_000_000  # env steps of all lanes; training ends with the update that reaches them
-    environments: int = 512  # lanes, divided evenly among the cores
+    environments: int = 2048  # lanes, divided evenly among the cores
     horizon: int = 64  # actions in each lane between updates
     repeat: int = 4  # env steps that each action lasts in training; a policy that plays acts in every one
     dense_reward_scale: float = 0.2  # 1/m; shaping reward in training, in place of the task's
-    epochs: int = 4  # passes over the samples of an update
+    epochs: int = 2  # passes over the samples of an update
     minibatches: int = 32  # updates of the weights in an epoch
-    learning_rate: float = 3e-4  # Adam's step size
+    learning_rate: float = 1e-3  # Adam's step size
     adam_epsilon: float = 1e-5  # Adam's epsilon
     max_gradient_norm: float = 1.0  # maximum global norm of the gradient
     discount: float = 0.995  # discount factor of rewards, per env step
     gae_lambda: float = 0.97  # lambda of advantage estimates, per action (Schulman et al. 2016, arXiv:1506.02438)
     clip: float = 0.2  # maximum change of the probability ratio, and of the value, in either direction
     value_weight: float = 0.5  # weight of the value function's loss
-    entropy_weight: float = 0.01  # weight of the policy's entropy, a bonus in the loss
+    entropy_weight: float = 0.005  # weight of the policy's entropy, a bonus in the loss
     average: float = 0.95  # maximum decay of the averaged weights, the policy; at update n at most n/(n+9)
     # with start=POLICY
     critic_updates: int = 10  # first updates, which fit the value function and leave the policy as it is
@@ -94,11 +94,11 @@ class PPOConfig:
 class CurriculumConfig:
     """Settings of the curriculum by learnability (hashable: pass as a static argument)."""
 
-    share: float = 0.5  # share of episodes in levels that the measurement kept, however few; the others draw from all
-    every: int = 100  # updates between measurements
-    candidates: int = 1024  # levels that are measured, drawn from all
-    measured_steps: int = 1024  # env steps of a measurement in each level; episodes have up to 256
-    keep: int = 256  # levels that are kept, those with the highest learnability
+    share: float = 0.75  # share of episodes in levels that the measurement kept, however few; the others draw from all
+    every: int = 16  # updates between measurements
+    candidates: int = 4096  # levels that are measured, drawn from all
+    measured_steps: int = 512  # env steps of a measurement in each level; episodes have up to 256
+    keep: int = 1536  # levels that are kept, those with the highest learnability
 
     def __post_init__(self) -> None:
         require(self, ("share",), 0, 1)

@@ -10,7 +10,7 @@ from levelproof import Failure, UserError
 from levelproof.pipeline.store.provenance import device
 
 KEPT = (
-    *("equal", "--ways", "from scratch, repeat=1", "--core-seconds", "3600", "--seeds", "2", "--levels", "40k"),
+    *("equal", "--ways", "from scratch, short actions", "--core-seconds", "3600", "--seeds", "2", "--levels", "40k"),
     *("--updates", "7000", "--cloning", "mirror=true", "pool=60000"),
 )
 TINY = ("ppo.environments=64", "ppo.horizon=32", "ppo.minibatches=4")
@@ -26,7 +26,7 @@ def test_search_of_a_stopped_run_is_refused(tmp_path: Path) -> None:
 def test_page_is_made_of_finished_runs_of_any_machine(tmp_path: Path) -> None:
     args = parser("equal").parse_args([*KEPT, "--only-finished"])
     rows = run(args).tables[0].rows
-    assert ["from scratch, repeat=1", "0", "AMD EPYC", "48,365,568"] in [row[:4] for row in rows]
+    assert ["from scratch, short actions", "0", "AMD EPYC", "48,365,568"] in [row[:4] for row in rows]
     args.finished = tmp_path
     with pytest.raises(UserError, match="has none of these runs"):
         run(args)
