@@ -9,6 +9,8 @@ from levelproof.physics.bounds import require
 
 CHUNK = 256  # lanes that go through the network together: their activations fit a core's cache
 
+MAX_REPEAT = 256  # env steps; an episode of the default rules is then one action
+
 
 @dataclass(frozen=True)
 class PPOConfig:
@@ -36,7 +38,8 @@ class PPOConfig:
     kl_updates: int = 60  # updates after the critic's over which the penalty falls to 0
 
     def __post_init__(self) -> None:
-        require(self, ("env_steps", "environments", "horizon", "repeat", "epochs", "minibatches"), 1)
+        require(self, ("env_steps", "environments", "horizon", "epochs", "minibatches"), 1)
+        require(self, ("repeat",), 1, MAX_REPEAT)
         require(self, ("learning_rate", "adam_epsilon", "max_gradient_norm"), 0, above=True)
         require(self, ("discount", "gae_lambda", "clip", "average"), 0, 1)
         require(self, ("value_weight", "entropy_weight", "kl_weight"), 0)

@@ -52,7 +52,7 @@ class UpdateFacts(NamedTuple):
 
     episodes: Int[Array, ""]  # that ended
     solved: Int[Array, ""]  # of them
-    actions: Int[Array, ""]  # of them
+    env_steps: Int[Array, ""]  # of them
     reward: Float[Array, ""]  # sum over them, shaping included
     entropy: Float[Array, ""]  # of the policy's live entries, nats; this and what follows are means over samples
     value_error: Float[Array, ""]
@@ -168,7 +168,8 @@ def _advance(
         update + 1,
     )
     count = lambda x: jnp.where(ended.done, x, 0).sum()
-    sums = jax.lax.psum((ended.done.sum(), count(ended.goal), count(ended.steps), count(ended.gained)), CORES)
+    steps = count(ended.steps) * ppo.repeat
+    sums = jax.lax.psum((ended.done.sum(), count(ended.goal), steps, count(ended.gained)), CORES)
     return after, UpdateFacts(*sums, *means)
 
 

@@ -177,7 +177,7 @@ def update_until_done(
     """
     last, first, per_update = recipe.ppo.updates, int(learner.updates), recipe.ppo.steps_per_update
     before, began, aside, recent = metrics.last.get("train/core_seconds", 0.0), time.monotonic(), 0.0, []
-    every, repeat = recipe.curriculum.every, recipe.ppo.repeat
+    every = recipe.curriculum.every
     with shown(console, "compiling", last, first) as show:
         for update in range(first + 1, last + 1):
             if every and (update - 1) % every == 0:
@@ -187,7 +187,7 @@ def update_until_done(
             if update == first + 1:
                 began = time.monotonic()  # compiling does not count
             rate = (update - first - 1) * per_update / max(time.monotonic() - began - aside, 1e-9)
-            words, solved = f"{update * per_update:,} env steps", averages(recent, repeat)["train/solve_rate"]
+            words, solved = f"{update * per_update:,} env steps", averages(recent)["train/solve_rate"]
             if np.isfinite(solved):
                 words += f" · {solved:.1%} solved"
             if rate:
@@ -195,7 +195,7 @@ def update_until_done(
             keep = update % interval == 0 or update == last
             if keep:
                 paused = time.monotonic()
-                numbers = {COURSE.step: update * per_update, "train/updates": update} | averages(recent, repeat)
+                numbers = {COURSE.step: update * per_update, "train/updates": update} | averages(recent)
                 numbers |= recipe.curriculum.facts(learner.curriculum)
                 numbers["train/env_steps_per_second"] = rate
                 numbers["train/core_seconds"] = before + time.process_time()
@@ -208,8 +208,8 @@ def update_until_done(
     return learner
 
 
-def averages(recent: Sequence[UpdateFacts], repeat: int) -> dict[str, float]:
-    """Return the metrics of some updates, of `repeat` env steps an action; NaN where no episode ended."""
+def averages(recent: Sequence[UpdateFacts]) -> dict[str, float]:
+    """Return the metrics of some updates; NaN where no episode ended."""
     total = UpdateFacts(*(np.sum(column) for column in zip(*recent, strict=True)))
     episodes = total.episodes or np.nan
     mean = lambda name: float(getattr(total, name) / len(recent))
@@ -217,7 +217,7 @@ def averages(recent: Sequence[UpdateFacts], repeat: int) -> dict[str, float]:
         "train/episodes": int(total.episodes),
         "train/solve_rate": float(total.solved / episodes),
         "train/return": float(total.reward / episodes),
-        "train/episode_steps": float(total.actions * repeat / episodes),
+        "train/episode_steps": float(total.env_steps / episodes),
         "loss/entropy": mean("entropy"),
         "loss/value": mean("value_error"),
         "loss/kl": mean("kl_to_before"),
