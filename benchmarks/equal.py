@@ -17,7 +17,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
 
-from benchmarks.cloning import SAMPLED, command, kept, lines_of, timed_split
+from benchmarks.cloning import SAMPLED, command, interval_text, kept, lines_of, timed_split
 from benchmarks.learners import ATTEMPTS, RATE, SECONDS, STEPS, add_ways, rates_text, slug
 from benchmarks.plotting import pyplot
 from benchmarks.report import Report, Table
@@ -89,29 +89,38 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--updates", type=int, default=1500, help="updates of a clone (default: 1500)")
     parser.add_argument("--cloning", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of a clone")
     parser.add_argument("--finished", type=Path, default=FINISHED, help="where finished runs are kept")
-    parser.add_argument("--only-finished", action="store_true", help="show finished runs, and make no other")
+    parser.add_argument(
+        "--only-finished",
+        action="store_true",
+        help="make no run, and show the longest finished run of each way and seed within --core-seconds",
+    )
 
 
 def run(args: argparse.Namespace) -> Report:
     runs = [(way, seed) for way in args.ways for seed in range(args.seeds)]
     if args.only_finished:
-        files = [file for one in runs for file in sorted(args.finished.glob(f"{stem_of(args, *one)[0]}-*.json"))]
+        results = [each for one in runs for each in longest(args, *one)]
     else:
         with ThreadPoolExecutor(len(own_cores())) as threads:
-            files = [*threads.map(lambda one: finished(args, *one), runs)]
-    if not files:
+            results = [json.loads(file.read_text()) for file in threads.map(lambda one: finished(args, *one), runs)]
+    if not results:
         raise UserError(f"--only-finished: {args.finished} has none of these runs; without it they are made.")
-    results = sorted((json.loads(file.read_text()) for file in files), key=lambda each: each["device"])
+    results.sort(key=lambda each: each["device"])
     players, dates = results[0]["sealed"], sorted(each["date"][:10] for each in results)
     rows = [list(row) for row in dict.fromkeys(tuple(row) for each in results for row in rows_of(each))]
     rows += [row_of(name, ("", "", "", "", ""), players, name) for name in PLAYERS if name in players[ALL]]
+    shown = {each["way"] for each in results}
     head = ("policy", "seed", "processor", "env steps", "core-seconds before training", "in all", *SHARES)
     return Report(
         "Learners at equal cost",
         results,
-        [Table(head, rows, f"Share of sealed levels of {args.size} solved with sampled actions; 95% intervals")],
         [
-            f"Every policy has {args.core_seconds:,.0f} core-seconds of one core, with compiling, for all that it is "
+            Table(head, rows, f"Share of sealed levels of {args.size} solved with sampled actions; 95% intervals"),
+            by_cost(results),
+        ],
+        [
+            f"Every policy has {args.core_seconds:,.0f} core-seconds of one core, with compiling (some ways had fewer "
+            "so far, as the table says), for all that it is "
             f"made from: the search of {args.levels} levels (`procedure=label`, ids from {FIRST:,} on, for the "
             f"second seed from {FIRST + BETWEEN_SEEDS:,}), the clone "
             f"({', '.join((f'{args.updates:,} updates', *(f'`{each}`' for each in args.cloning)))}), and "
@@ -121,7 +130,7 @@ def run(args: argparse.Namespace) -> Report:
             f"{players[ALL]['random']['levels']:,} levels, of which some cannot be solved; *of solved*, and the best "
             f"of 8 attempts at them: the {players[SOLVED]['random']['levels']:,} that are labelled solved.",
             *dict.fromkeys(each["remark"] for each in results if "remark" in each),
-            *(f"{way}: `levelproof train {words_of(args, way, 0)}{started(way)}`." for way in args.ways),
+            *(f"{way}: `levelproof train {words_of(args, way, 0)}{started(way)}`." for way in WAYS if way in shown),
             f"![Shares that reach the goal, in training and of sealed levels, against core-seconds]({PLOT})",
             "On the left, episodes of training: of the weights as they act, in random levels never played before, or "
             "in the levels that a way trains on. On the right, as in the table, the sealed levels labelled solved that "
@@ -131,6 +140,18 @@ def run(args: argparse.Namespace) -> Report:
         plots={PLOT: partial(draw, results)},
         made=f"{' to '.join(dict.fromkeys((dates[0], dates[-1])))}, on the processors in the table",
     )  # fmt: skip
+
+
+def longest(args: argparse.Namespace, way: str, seed: int) -> list[dict[str, Any]]:
+    """Return the results of a way's longest finished run within the core-seconds, on every processor that has one."""
+    about, best = stem_of(args, way, seed)[1], {}
+    for file in sorted(args.finished.glob(f"{slug(way)}-{args.size}-{seed}-*.json")):
+        each = json.loads(file.read_text())
+        is_this = all(each[name] == value for name, value in about.items() if name != "core_seconds")
+        shown = best.get(each["device"])
+        if is_this and each["core_seconds"] <= args.core_seconds:
+            best[each["device"]] = max(each, shown or each, key=lambda run: run["core_seconds"])
+    return [*best.values()]
 
 
 def stem_of(args: argparse.Namespace, way: str, seed: int) -> tuple[str, dict[str, Any]]:
@@ -267,6 +288,26 @@ def rows_of(each: Mapping[str, Any]) -> list[list[str]]:
         rows.append(row_of(name, cost, each["cloned"]))
     cost = *run, f"{last[STEPS]:,}", f"{each['before']:,.0f}", f"{each['before'] + last[SECONDS]:,.0f}"
     return [*rows, row_of(each["way"], cost, each["sealed"])]
+
+
+def by_cost(results: Sequence[Mapping[str, Any]]) -> Table:
+    """Return the shares of solved sealed levels that policies had after some core-seconds, those before included."""
+    shares = [dict(after(each)) for each in results]
+    costs = sorted({cost for each in shares for cost in each})
+    rows = [
+        [each["way"], str(each["seed"]), *(interval_text(share[cost]) if cost in share else "" for cost in costs)]
+        for each, share in zip(results, shares, strict=True)
+    ]
+    head = ("policy", "seed", *(f"after {cost:,.0f}" for cost in costs))
+    return Table(head, rows, "Share of the levels labelled solved, after some core-seconds")
+
+
+def after(each: Mapping[str, Any]) -> list[tuple[float, Mapping[str, Any]]]:
+    """Return the core-seconds after which a policy was to be measured, and its share of the solved levels then."""
+    planned = [share * each["core_seconds"] for share in LOOKS if share * each["core_seconds"] > each["before"]]
+    end = [(each["core_seconds"], each["sealed"][SOLVED][SAMPLED]["once"])]
+    looks = [look["solved"] for look in each.get("looks", [])]
+    return [*zip(planned, looks, strict=True)] if looks else end
 
 
 def row_of(name: str, cost: Sequence[str], rates: Mapping[str, Any], player: str = SAMPLED) -> list[str]:

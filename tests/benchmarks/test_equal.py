@@ -32,6 +32,21 @@ def test_page_is_made_of_finished_runs_of_any_machine(tmp_path: Path) -> None:
         run(args)
 
 
+def test_page_has_the_longest_run_within_its_core_seconds(tmp_path: Path) -> None:
+    args = parser("equal").parse_args([*KEPT, "--only-finished"])
+    kept = next(args.finished.glob("from-scratch-short-actions-s-0-*"))
+    shorter = kept.read_text().replace('"core_seconds": 3600.0', '"core_seconds": 1800.0', 1)
+    shorter = shorter.replace("48365568", "24000000")
+    (tmp_path / kept.name.replace("s-0-", "s-0-0")).write_text(shorter)
+    (tmp_path / kept.name).write_text(kept.read_text())
+    args.finished = tmp_path
+    for limit, steps, after in (3600.0, "48,365,568", "after 3,600"), (1800.0, "24,000,000", "after 1,800"):
+        args.core_seconds = limit
+        table, by_cost = run(args).tables
+        assert table.rows[0][3] == steps
+        assert by_cost.head == ("policy", "seed", after)
+
+
 @pytest.mark.campaign
 def test_ways_end_at_the_same_core_seconds(tmp_path: Path) -> None:
     words = ["equal", "--ways", "from scratch", "levels, clone, reinforcement", "--core-seconds", "200"]
