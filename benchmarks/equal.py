@@ -33,7 +33,8 @@ LOOKS = 0.25, 0.5, 1.0  # shares of the core-seconds after which a policy is mea
 FIRST = 50_000  # id of the first level to clone from; the measured ones are sealed
 BETWEEN_SEEDS = 10_000_000  # ids
 SCRATCH = ("network.width=64",)
-SHORT = "ppo.repeat=1"  # actions of one env step in training, too
+ALL_SAMPLES = "ppo.gae_lambda=0.97", "ppo.subsample=1"  # learn from all of them, with longer traces of advantages
+SHORT = "ppo.repeat=1", *ALL_SAMPLES  # actions of one env step in training, too
 TUNING = ("ppo.learning_rate=2e-4", "ppo.entropy_weight=0.002", "ppo.critic_updates=5")
 PLOT = "equal.svg"
 UPDATES = "train/updates"
@@ -61,9 +62,12 @@ class Way(NamedTuple):
 SEARCHING = Lock()  # several ways share levels and a clone
 WAYS = {
     "from scratch": Way(SCRATCH, colour="#0072b2"),
-    "from scratch, short actions": Way((*SCRATCH, "ppo.learning_rate=3e-4", SHORT), colour="#99bbdd"),
+    "from scratch, all samples": Way((*SCRATCH, *ALL_SAMPLES), colour="#6699cc"),
+    "from scratch, short actions": Way((*SCRATCH, "ppo.learning_rate=3e-4", *SHORT), colour="#99bbdd"),
     "from scratch, learnability": Way((*SCRATCH, "levels=learnability"), colour="#56b4e9"),
     "from scratch, replay": Way((*SCRATCH, "levels=replay"), colour="#117733"),
+    "from scratch, learnability, all samples": Way((*SCRATCH, "levels=learnability", *ALL_SAMPLES), colour="#aaddee"),
+    "from scratch, replay, all samples": Way((*SCRATCH, "levels=replay", *ALL_SAMPLES), colour="#88bb99"),
     "from scratch, evolve": Way((*SCRATCH, "levels=evolve"), colour="#882255"),
     "levels, reinforcement on these levels": Way(SCRATCH, colour="#000000", own_levels=True),
     "levels, clone, reinforcement": Way(TUNING, CLONE, "#d55e00"),
@@ -72,8 +76,11 @@ WAYS = {
     "levels, clone, learnability on these levels": Way(
         (*TUNING, "choice=learnability"), CLONE, "#999933", own_levels=True
     ),
+    "levels, clone, learnability on these levels, all samples": Way(
+        (*TUNING, "choice=learnability", *ALL_SAMPLES), CLONE, "#b3b366", own_levels=True
+    ),
     "levels, clone, learnability on these levels, short actions": Way(
-        (*TUNING, "choice=learnability", SHORT), CLONE, "#cccc88", own_levels=True
+        (*TUNING, "choice=learnability", *SHORT), CLONE, "#cccc88", own_levels=True
     ),
     "levels, clone, teachers, reinforcement on these levels": Way(
         TUNING, CLONE, "#661100", own_levels=True, teachers=True
@@ -302,7 +309,7 @@ def by_cost(results: Sequence[Mapping[str, Any]]) -> Table:
     return Table(head, rows, "Share of the levels labelled solved, after some core-seconds")
 
 
-def after(each: Mapping[str, Any]) -> list[tuple[float, Mapping[str, Any]]]:
+def after(each: Mapping[str, Any]) -> list[tuple[float, dict[str, Any]]]:
     """Return the core-seconds after which a policy was to be measured, and its share of the solved levels then."""
     planned = [share * each["core_seconds"] for share in LOOKS if share * each["core_seconds"] > each["before"]]
     end = [(each["core_seconds"], each["sealed"][SOLVED][SAMPLED]["once"])]

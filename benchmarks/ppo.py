@@ -13,7 +13,7 @@ from levelproof.levelgen.level import SIZES
 from levelproof.pipeline.runtime import own_cores
 
 RATE, STEPS = "train/env_steps_per_second", "train/env_steps"
-SETTINGS = ("ppo.environments=512", "ppo.horizon=64", "ppo.epochs=2", "ppo.repeat=1")  # as in the pilot
+SETTINGS = ("ppo.environments=512", "ppo.horizon=64", "ppo.epochs=2", "ppo.repeat=1", "ppo.subsample=1")  # as the pilot
 
 
 def register(parser: argparse.ArgumentParser) -> None:

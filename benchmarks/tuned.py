@@ -18,7 +18,7 @@ from levelproof.pipeline.learn.evaluate import ALL
 from levelproof.pipeline.learn.published import HANDMADE, HANDMADE_LEVELS, PROTOCOLS, handmade_folder
 from levelproof.pipeline.runtime import own_cores
 
-LARGE = ("ppo.environments=1024", "ppo.epochs=2", "ppo.repeat=1")
+LARGE = ("ppo.environments=1024", "ppo.epochs=2", "ppo.repeat=1", "ppo.gae_lambda=0.97", "ppo.subsample=1")
 WAYS = {  # name: settings of `levelproof train`
     "tuned": (*LARGE, "ppo.learning_rate=2e-4", "ppo.entropy_weight=0.002", "ppo.critic_updates=5"),
     "from scratch": (*LARGE, "ppo.learning_rate=3e-4", "ppo.entropy_weight=0.005", "network.width=64"),

@@ -62,11 +62,12 @@ def normalised(advantage: Float[Array, "..."]) -> Float[Array, "..."]:
     return (advantage - advantage.mean()) / (advantage.std() + ADVANTAGE_EPSILON)
 
 
-def normalised_over(axis_name: str, advantage: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Do as `normalised` for a minibatch that is distributed over a mapped axis, in equal shares."""
-    mean = lambda x: jax.lax.pmean(x.mean(), axis_name)
-    centred = advantage - mean(advantage)
-    return centred / (jnp.sqrt(mean(jnp.square(centred))) + ADVANTAGE_EPSILON)
+def normalised_over(axis_name: str, advantage: Float[Array, "..."], counts: Bool[Array, "..."]) -> Float[Array, "..."]:
+    """Do as `normalised` for the samples that count, distributed over a mapped axis; the others' advantage is 0."""
+    total = lambda x: jax.lax.psum(jnp.where(counts, x, 0.0).sum(), axis_name)
+    count = jnp.maximum(total(1.0), 1.0)
+    centred = jnp.where(counts, advantage - total(advantage) / count, 0.0)
+    return centred / (jnp.sqrt(total(jnp.square(centred)) / count) + ADVANTAGE_EPSILON)
 
 
 def terms(
@@ -79,6 +80,7 @@ def terms(
     advantage: Float[Array, " sample"],
     gain: Float[Array, " sample"],
     clip: float,
+    weight: Float[Array, " sample"] | float = 1.0,
 ) -> Terms:
     """Compare a policy and its values with what was sampled from an earlier one.
 
@@ -92,12 +94,14 @@ def terms(
         advantage: of the action.
         gain: the advantage, `normalised` over the minibatch.
         clip: maximum change of the probability ratio, and of the value.
+        weight: of each sample in all means.
     """
     log_now = log_probability(logits, action, live)  # type: ignore[arg-type]
     ratio = jnp.exp(log_now - log_before)
-    surrogate = jnp.minimum(ratio * gain, jnp.clip(ratio, 1 - clip, 1 + clip) * gain).mean()
+    mean = lambda x: (weight * x).mean()
+    surrogate = mean(jnp.minimum(ratio * gain, jnp.clip(ratio, 1 - clip, 1 + clip) * gain))
 
     target = value_before + advantage
     near = value_before + jnp.clip(value - value_before, -clip, clip)
-    error = 0.5 * jnp.maximum(jnp.square(value - target), jnp.square(near - target)).mean()
-    return Terms(surrogate, error, entropy(logits, live).mean(), log_now)
+    error = 0.5 * mean(jnp.maximum(jnp.square(value - target), jnp.square(near - target)))
+    return Terms(surrogate, error, mean(entropy(logits, live)), log_now)

@@ -21,13 +21,14 @@ class PPOConfig:
     horizon: int = 64  # actions in each lane between updates
     repeat: int = 4  # env steps that each action lasts in training; a policy that plays acts in every one
     dense_reward_scale: float = 0.2  # 1/m; shaping reward in training, in place of the task's
+    subsample: float = 0.5  # share of the samples that are learned from, large advantages more often; 1: all
     epochs: int = 2  # passes over the samples of an update
     minibatches: int = 32  # updates of the weights in an epoch
     learning_rate: float = 1e-3  # Adam's step size
     adam_epsilon: float = 1e-5  # Adam's epsilon
     max_gradient_norm: float = 1.0  # maximum global norm of the gradient
     discount: float = 0.995  # discount factor of rewards, per env step
-    gae_lambda: float = 0.97  # lambda of advantage estimates, per action (Schulman et al. 2016, arXiv:1506.02438)
+    gae_lambda: float = 0.9  # lambda of advantage estimates, per action (Schulman et al. 2016, arXiv:1506.02438)
     clip: float = 0.2  # maximum change of the probability ratio, and of the value, in either direction
     value_weight: float = 0.5  # weight of the value function's loss
     entropy_weight: float = 0.005  # weight of the policy's entropy, a bonus in the loss
@@ -41,6 +42,7 @@ class PPOConfig:
         require(self, ("env_steps", "environments", "horizon", "epochs", "minibatches"), 1)
         require(self, ("repeat",), 1, MAX_REPEAT)
         require(self, ("learning_rate", "adam_epsilon", "max_gradient_norm"), 0, above=True)
+        require(self, ("subsample",), 0, 1, above=True)
         require(self, ("discount", "gae_lambda", "clip", "average"), 0, 1)
         require(self, ("value_weight", "entropy_weight", "kl_weight"), 0)
         require(self, ("dense_reward_scale",), 0, MAX_REWARD_SCALE)
@@ -72,11 +74,11 @@ class PPOConfig:
     def shares_out(self, cores: int) -> bool:
         """Whether this number of cores divides the lanes evenly, and minibatches the chunks of a core."""
         with suppress(ValueError):
-            return bool(self.chunk(cores))
+            return bool(self.samples(cores))
         return False
 
-    def chunk(self, cores: int) -> int:
-        """Return the number of a core's lanes that go through the network together.
+    def samples(self, cores: int) -> int:
+        """Return how many samples a core learns from at every time, a whole number of chunks.
 
         Raises:
             ValueError: the cores do not divide the lanes evenly, or the minibatches the chunks of a core.
@@ -88,9 +90,11 @@ class PPOConfig:
                 f"environments is {self.environments}: with {cores} cores it must be a multiple of "
                 f"{cores if self.environments < cores * CHUNK else cores * CHUNK}"
             )
-        if (chunks := lanes // width * self.horizon) % self.minibatches:
+        some = max(int(lanes * self.subsample), 1)
+        some -= some % min(some, CHUNK)
+        if (chunks := some // min(some, CHUNK) * self.horizon) % self.minibatches:
             raise ValueError(f"minibatches is {self.minibatches}: it must divide {chunks}, the chunks of a core")
-        return width
+        return some
 
 
 @dataclass(frozen=True)

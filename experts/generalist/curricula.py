@@ -21,7 +21,7 @@ Attempt = Callable[[Int[Array, " level"], int, Key[Array, ""]], tuple[Array, Arr
 
 
 class EndedEpisodes(NamedTuple):
-    """Episodes of all lanes and cores in one update, one per env step and lane; the rest counts where `done`."""
+    """Episodes of all lanes and cores in one update, one per action and lane; the rest counts where `done`."""
 
     done: Bool[Array, " episode"]
     level_index: Int[Array, " episode"]

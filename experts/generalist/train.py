@@ -21,6 +21,7 @@ from levelproof.experts.generalist.actor_critic import ActorCriticParams, initia
 from levelproof.experts.generalist.config import CHUNK, PPOConfig
 from levelproof.experts.generalist.curricula import Curriculum, EndedEpisodes
 from levelproof.experts.generalist.rollout import Ended, Experience, Playing, begin, rollout
+from levelproof.experts.generalist.subsample import choose
 from levelproof.experts.networks.layers import LOGITS
 from levelproof.experts.networks.over_levels import NetworkConfig, logits_and_summary
 from levelproof.experts.objective import advantages, normalised_over, terms
@@ -88,7 +89,8 @@ class Chunk(NamedTuple):
     log_probability: Float[Array, " sample"]
     value: Float[Array, " sample"]
     advantage: Float[Array, " sample"]
-    counts: Bool[Array, " sample"]  # whether the action is learned from
+    gain: Float[Array, " sample"]  # the advantage, normalised over all samples of the update
+    weight: Float[Array, " sample"]  # in means; 0: not learned from
     logits_of_start: Float[Array, "logit sample"]
 
 
@@ -150,14 +152,14 @@ def _advance(
     """Act in a core's lanes, and take one update together with the other cores."""
     ppo, update = recipe.ppo, learner.updates
     key = jax.random.fold_in(_key(recipe, update), jax.lax.axis_index(CORES))
-    of_rollout, of_epochs = jax.random.split(key)
+    of_rollout, of_choice, of_epochs = jax.random.split(key, 3)
     table = recipe.curriculum.table(table, learner.curriculum)
     draw = partial(recipe.curriculum.draw, table, learner.curriculum)
     playing, experience, ended = rollout(
         learner.params, recipe.network, table, learner.playing, draw, of_rollout, ppo.horizon,
         recipe.rules,
     )  # fmt: skip
-    chunks = _chunks(recipe, experience, start, update)
+    chunks = _chunks(recipe, experience, start, update, of_choice)
     params, optimiser, means = _epochs(recipe, learner, chunks, of_epochs, start is not None)
     after = Learner(
         params,
@@ -195,22 +197,35 @@ def _advantages(experience: Experience, config: PPOConfig) -> Float[Array, "time
     return advantages(experience.value, reward, over, jnp.zeros_like(reward[0]), per_action)
 
 
-def _chunks(recipe: TrainingRecipe, experience: Experience, start: VariableDict | None, update: Array) -> Chunk:
-    """Return a core's samples as chunks, chunk axis first."""
-    lanes = experience.value.shape[-1]
-    width = min(lanes, CHUNK)
+def _samples(ppo: PPOConfig, experience: Experience, key: Key[Array, ""]) -> Chunk:
+    """Return the samples of a core that are learned from, time first."""
+    counts = ~_open_ended(experience)
+    advantage = _advantages(experience, ppo)
+    gain = normalised_over(CORES, advantage, counts)
+    samples = Chunk(
+        experience.seen, experience.live, experience.action, experience.log_probability, experience.value, advantage,
+        gain, counts.astype(gain.dtype), jnp.zeros((len(gain), 0, gain.shape[-1])),
+    )  # fmt: skip
+    if ppo.subsample == 1:
+        return samples
+    lane, weight = choose(gain, counts, ppo.samples(jax.lax.axis_size(CORES)), key)
+    take = jax.vmap(partial(jnp.take, axis=-1))
+    return jax.tree.map(lambda x: take(x, lane), samples)._replace(weight=weight)
 
-    def cut(x: Array) -> Array:  # [time, ..., lane] to [chunk, ..., sample]
-        parted = jnp.moveaxis(x.reshape(*x.shape[:-1], lanes // width, width), -2, 1)
+
+def _chunks(
+    recipe: TrainingRecipe, experience: Experience, start: VariableDict | None, update: Array, key: Key[Array, ""]
+) -> Chunk:
+    """Return a core's samples as chunks, chunk axis first."""
+    samples = _samples(recipe.ppo, experience, key)
+    count = samples.value.shape[-1]
+    width = min(count, CHUNK)
+
+    def cut(x: Array) -> Array:  # [time, ..., sample] to [chunk, ..., sample]
+        parted = jnp.moveaxis(x.reshape(*x.shape[:-1], count // width, width), -2, 1)
         return parted.reshape(parted.shape[0] * parted.shape[1], *parted.shape[2:])
 
-    advantage = _advantages(experience, recipe.ppo)
-    of_start = jnp.zeros((len(experience.value), 0, lanes))
-    chunks = Chunk(
-        experience.seen, experience.live, experience.action, experience.log_probability, experience.value, advantage,
-        ~_open_ended(experience), of_start,
-    )  # fmt: skip
-    chunks = jax.tree.map(cut, chunks)
+    chunks = jax.tree.map(cut, samples)
     if start is None:
         return chunks
     logits = lambda observation: logits_and_summary(start, recipe.network, recipe.size, observation)[0]
@@ -231,13 +246,12 @@ def _epochs(
         params, state = now
         batch = jax.tree.map(lambda x: x[index], chunks)
 
-        def add(total: Any, each: tuple[Chunk, Array]) -> tuple[Any, None]:
-            (_, means), gradient = loss(params, *each)
+        def add(total: Any, each: Chunk) -> tuple[Any, None]:
+            (_, means), gradient = loss(params, each)
             return jax.tree.map(jnp.add, total, (gradient, means)), None
 
         zeros = jax.tree.map(jnp.zeros_like, (params, (0.0,) * TERMS))
-        gain = jnp.where(batch.counts, normalised_over(CORES, batch.advantage), 0.0)
-        total, _ = jax.lax.scan(add, zeros, (batch, gain))
+        total, _ = jax.lax.scan(add, zeros, batch)
         gradient, means = jax.lax.pmean(jax.tree.map(lambda x: x / len(index), total), CORES)
         if starts:
             gradient = gradient._replace(policy=jax.tree.map(lambda x: jnp.where(fitting, 0, x), gradient.policy))
@@ -257,19 +271,21 @@ def _epochs(
 
 
 def _loss(
-    params: ActorCriticParams, chunk: Chunk, gain: Array, recipe: TrainingRecipe, kl_weight: Array
+    params: ActorCriticParams, chunk: Chunk, recipe: TrainingRecipe, kl_weight: Array
 ) -> tuple[Float[Array, ""], tuple[Array, ...]]:
     ppo = recipe.ppo
     logits, value = logits_and_value(params, recipe.network, recipe.size, chunk.seen)
     now = terms(
-        logits, value, chunk.action, chunk.live, chunk.log_probability, chunk.value, chunk.advantage, gain, ppo.clip
-    )
+        logits, value, chunk.action, chunk.live, chunk.log_probability, chunk.value, chunk.advantage, chunk.gain,
+        ppo.clip, chunk.weight,
+    )  # fmt: skip
+    mean = lambda x: (chunk.weight * x).mean()
     change = now.log_probability - chunk.log_probability
-    moved = (jnp.exp(change) - 1 - change).mean()  # Schulman's estimate, which is never negative
+    moved = mean(jnp.exp(change) - 1 - change)  # Schulman's estimate, which is never negative
     total = ppo.value_weight * now.value_error - now.surrogate - ppo.entropy_weight * now.entropy
     from_start = jnp.zeros(())
     if len(chunk.logits_of_start):
-        from_start = divergence(logits, chunk.logits_of_start, chunk.live).mean()
+        from_start = mean(divergence(logits, chunk.logits_of_start, chunk.live))
         total += jnp.where(kl_weight > 0, kl_weight * from_start, 0.0)
     return total, (now.entropy, now.value_error, moved, jnp.where(kl_weight > 0, from_start, 0.0))
 

@@ -127,7 +127,7 @@ def prepared_cores(config: TrainConfig, note: dict[str, Any] | None) -> int:
 def recipe_of(config: TrainConfig, source: TrainingLevels, start: Policy | None, cores: int) -> TrainingRecipe:
     """Return what decides the programs. Raise UserError if the cores do not divide the lanes evenly."""
     try:
-        config.ppo.chunk(cores)
+        config.ppo.samples(cores)
     except ValueError as error:
         raise UserError(f"ppo.{error}.") from None
     network = start.network if start else config.network

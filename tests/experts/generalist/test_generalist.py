@@ -77,10 +77,12 @@ def test_repeated_action_does_what_as_many_env_steps_do(repeat: int) -> None:
     assert not goal.any()
 
 
-def test_shares_of_a_minibatch_are_normalised_together() -> None:
+def test_cores_normalise_the_samples_that_count_together() -> None:
     advantage = jax.random.normal(jax.random.key(0), (4, 8)) * jnp.arange(4)[:, None]
-    parts = jax.vmap(partial(normalised_over, "core"), axis_name="core")(advantage)
-    np.testing.assert_allclose(parts, normalised(advantage), rtol=1e-5, atol=1e-6)
+    counts = jnp.arange(8) != 3
+    parts = jax.vmap(partial(normalised_over, "core"), axis_name="core")(advantage, jnp.broadcast_to(counts, (4, 8)))
+    np.testing.assert_allclose(parts[:, counts], normalised(advantage[:, counts]), rtol=1e-5, atol=1e-6)
+    assert not parts[:, 3].any()
 
 
 def test_kl_penalty_waits_for_the_critic_then_falls_to_zero() -> None:

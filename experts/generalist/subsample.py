@@ -1,0 +1,41 @@
+"""Which samples of a rollout an update learns from.
+
+Most samples teach little: in a level that the policy always solves, or never does, the advantage is near 0. The
+gradient takes most of the time of an update, so learning from a part of the samples, those of large advantages more
+often, lets as much time see more levels. Weights undo the preference: a weighted mean over the chosen samples has the
+expectation of the mean over all (importance sampling, as Katharopoulos and Fleuret 2018, arXiv:1803.00942, choose
+samples by a bound of their gradient's norm).
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+EVEN = 0.5  # what every sample's chance has besides its gain, in multiples of the mean gain; bounds the weights
+LEAST = 1e-9  # chance below which a sample's weight is 0 for want of anything to choose
+
+
+def choose(
+    gain: Float[Array, "time lane"], counts: Bool[Array, "time lane"], samples: int, key: Key[Array, ""]
+) -> tuple[Int[Array, "time sample"], Float[Array, "time sample"]]:
+    """Choose as many lanes at every time, with chances that grow with the size of their gain.
+
+    The choice is systematic: a lane whose chance is k in `samples` is chosen k times, rounded up or down.
+
+    Args:
+        gain: advantages, normalised.
+        counts: whether a sample may be learned from; others are never chosen.
+        samples: lanes to choose at every time.
+        key: consumed.
+
+    Returns:
+        The chosen lanes, ascending, and the weight of each: the mean of weight times x over the chosen ones estimates
+        the sum of x over those that count, divided by the number of lanes. Where none counts, all weights are 0.
+    """
+    size = jnp.where(counts, jnp.abs(gain), 0.0)
+    chance = jnp.where(counts, size + EVEN * size.mean(), 0.0)
+    edges = jnp.cumsum(chance, 1)
+    total = edges[:, -1:]
+    at = (jnp.arange(samples) + jax.random.uniform(key, (len(gain), 1))) / samples * total
+    lane = jnp.minimum(jax.vmap(lambda edge, x: jnp.searchsorted(edge, x, side="right"))(edges, at), gain.shape[1] - 1)
+    return lane, total / (gain.shape[1] * jnp.maximum(jnp.take_along_axis(chance, lane, 1), LEAST))
