@@ -205,7 +205,7 @@ def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
     for spent in (end for end in ends if end > before):
         curve = trained(args, folder, way, start, seed, spent - before)
         rates = kept(args.folder / f"{folder.name}-{curve[-1][STEPS]}-{args.measured}.json", folder, *measuring(args))
-        looks.append({SECONDS: before + curve[-1][SECONDS], "solved": rates[SOLVED][SAMPLED]["once"]})
+        looks.append({"planned": spent, SECONDS: before + curve[-1][SECONDS], "solved": rates[SOLVED][SAMPLED]["once"]})
     lines = [*curve[:: -(-len(curve) // POINTS)], curve[-1]]
     some = [{name: line.get(name) for name in (UPDATES, STEPS, SECONDS, RATE)} for line in lines]
     return {"before": before, "curve": some, "looks": looks, "sealed": rates, "cloned": clone}
@@ -288,7 +288,7 @@ def trained(
 
 def rows_of(each: Mapping[str, Any]) -> list[list[str]]:
     """Return the rows of a policy: of its clone, if it has one, and of itself."""
-    last, rows, run = each["curve"][-1], [], (str(each["seed"]), each["device"].removeprefix("cpu: "))
+    last, rows, run = each["curve"][-1], [], run_of(each)
     if each["cloned"]:
         cost = *run, "0", "", f"{each['before']:,.0f}"
         name = "levels, clone, teachers" if WAYS[each["way"]].teachers else "levels, clone"
@@ -297,24 +297,27 @@ def rows_of(each: Mapping[str, Any]) -> list[list[str]]:
     return [*rows, row_of(each["way"], cost, each["sealed"])]
 
 
+def run_of(each: Mapping[str, Any]) -> tuple[str, str]:
+    """Return a run's seed and processor."""
+    return str(each["seed"]), each["device"].removeprefix("cpu: ")
+
+
 def by_cost(results: Sequence[Mapping[str, Any]]) -> Table:
     """Return the shares of solved sealed levels that policies had after some core-seconds, those before included."""
     shares = [dict(after(each)) for each in results]
     costs = sorted({cost for each in shares for cost in each})
     rows = [
-        [each["way"], str(each["seed"]), *(interval_text(share[cost]) if cost in share else "" for cost in costs)]
+        [each["way"], *run_of(each), *(interval_text(share[cost]) if cost in share else "" for cost in costs)]
         for each, share in zip(results, shares, strict=True)
     ]
-    head = ("policy", "seed", *(f"after {cost:,.0f}" for cost in costs))
+    head = ("policy", "seed", "processor", *(f"after {cost:,.0f}" for cost in costs))
     return Table(head, rows, "Share of the levels labelled solved, after some core-seconds")
 
 
 def after(each: Mapping[str, Any]) -> list[tuple[float, dict[str, Any]]]:
     """Return the core-seconds after which a policy was to be measured, and its share of the solved levels then."""
-    planned = [share * each["core_seconds"] for share in LOOKS if share * each["core_seconds"] > each["before"]]
     end = [(each["core_seconds"], each["sealed"][SOLVED][SAMPLED]["once"])]
-    looks = [look["solved"] for look in each.get("looks", [])]
-    return [*zip(planned, looks, strict=True)] if looks else end
+    return [(look["planned"], look["solved"]) for look in each.get("looks", [])] or end
 
 
 def row_of(name: str, cost: Sequence[str], rates: Mapping[str, Any], player: str = SAMPLED) -> list[str]:

@@ -1,6 +1,7 @@
 """The objective of proximal policy optimisation and its advantages, for experts and for policies for all levels.
 
-Schulman et al. 2017 (arXiv:1707.06347) with clipped values and per-minibatch normalised advantages.
+Schulman et al. 2017 (arXiv:1707.06347) with clipped values and normalised advantages: an expert's in each minibatch,
+those of a policy for all levels over a whole update.
 """
 
 from typing import NamedTuple, Protocol

@@ -93,7 +93,10 @@ class PPOConfig:
         some = max(int(lanes * self.subsample), 1)
         some -= some % min(some, CHUNK)
         if (chunks := some // min(some, CHUNK) * self.horizon) % self.minibatches:
-            raise ValueError(f"minibatches is {self.minibatches}: it must divide {chunks}, the chunks of a core")
+            raise ValueError(
+                f"minibatches is {self.minibatches}: it must divide {chunks}, the chunks of samples of a core "
+                f"(horizon = {self.horizon}, subsample = {self.subsample:g})"
+            )
         return some
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 EVEN = 0.5  # what every sample's chance has besides its gain, in multiples of the mean gain; bounds the weights
-LEAST = 1e-9  # chance below which a sample's weight is 0 for want of anything to choose
+LEAST = 1e-6  # of every chance, so that samples are chosen evenly where no gain differs from 0
 
 
 def choose(
@@ -33,9 +33,11 @@ def choose(
         the sum of x over those that count, divided by the number of lanes. Where none counts, all weights are 0.
     """
     size = jnp.where(counts, jnp.abs(gain), 0.0)
-    chance = jnp.where(counts, size + EVEN * size.mean(), 0.0)
+    chance = jnp.where(counts, size + EVEN * size.mean() + LEAST, 0.0)
     edges = jnp.cumsum(chance, 1)
     total = edges[:, -1:]
     at = (jnp.arange(samples) + jax.random.uniform(key, (len(gain), 1))) / samples * total
+    at = jnp.minimum(at, jnp.nextafter(total, jnp.zeros_like(total)))  # rounded up to the total it would be beyond all
     lane = jnp.minimum(jax.vmap(lambda edge, x: jnp.searchsorted(edge, x, side="right"))(edges, at), gain.shape[1] - 1)
-    return lane, total / (gain.shape[1] * jnp.maximum(jnp.take_along_axis(chance, lane, 1), LEAST))
+    own = jnp.take_along_axis(chance, lane, 1)
+    return lane, jnp.where(own > 0, total / (gain.shape[1] * jnp.where(own > 0, own, 1.0)), 0.0)

@@ -21,7 +21,7 @@ from levelproof.experts.generalist.actor_critic import ActorCriticParams, initia
 from levelproof.experts.generalist.config import CHUNK, PPOConfig
 from levelproof.experts.generalist.curricula import Curriculum, EndedEpisodes
 from levelproof.experts.generalist.rollout import Ended, Experience, Playing, begin, rollout
-from levelproof.experts.generalist.subsample import choose
+from levelproof.experts.generalist.subsample import LEAST, choose
 from levelproof.experts.networks.layers import LOGITS
 from levelproof.experts.networks.over_levels import NetworkConfig, logits_and_summary
 from levelproof.experts.objective import advantages, normalised_over, terms
@@ -202,15 +202,16 @@ def _samples(ppo: PPOConfig, experience: Experience, key: Key[Array, ""]) -> Chu
     counts = ~_open_ended(experience)
     advantage = _advantages(experience, ppo)
     gain = normalised_over(CORES, advantage, counts)
+    share = jnp.maximum(jax.lax.pmean(counts.mean(), CORES), LEAST)  # divides weights, so that their mean is 1
     samples = Chunk(
         experience.seen, experience.live, experience.action, experience.log_probability, experience.value, advantage,
-        gain, counts.astype(gain.dtype), jnp.zeros((len(gain), 0, gain.shape[-1])),
+        gain, counts / share, jnp.zeros((len(gain), 0, gain.shape[-1])),
     )  # fmt: skip
     if ppo.subsample == 1:
         return samples
     lane, weight = choose(gain, counts, ppo.samples(jax.lax.axis_size(CORES)), key)
     take = jax.vmap(partial(jnp.take, axis=-1))
-    return jax.tree.map(lambda x: take(x, lane), samples)._replace(weight=weight)
+    return jax.tree.map(lambda x: take(x, lane), samples)._replace(weight=weight / share)
 
 
 def _chunks(

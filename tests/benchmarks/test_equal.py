@@ -37,14 +37,14 @@ def test_page_has_the_longest_run_within_its_core_seconds(tmp_path: Path) -> Non
     kept = next(args.finished.glob("from-scratch-short-actions-s-0-*"))
     shorter = kept.read_text().replace('"core_seconds": 3600.0', '"core_seconds": 1800.0', 1)
     shorter = shorter.replace("48365568", "24000000")
-    (tmp_path / kept.name.replace("s-0-", "s-0-0")).write_text(shorter)
+    (tmp_path / kept.name.replace("s-0-", "s-0-f")).write_text(shorter)
     (tmp_path / kept.name).write_text(kept.read_text())
     args.finished = tmp_path
     for limit, steps, after in (3600.0, "48,365,568", "after 3,600"), (1800.0, "24,000,000", "after 1,800"):
         args.core_seconds = limit
         table, by_cost = run(args).tables
         assert table.rows[0][3] == steps
-        assert by_cost.head == ("policy", "seed", after)
+        assert by_cost.head == ("policy", "seed", "processor", after)
 
 
 @pytest.mark.campaign

@@ -13,7 +13,7 @@ from levelproof.experts.generalist.curricula import fresh
 from levelproof.experts.generalist.learnability import learnability
 from levelproof.experts.generalist.rollout import Experience, table_of
 from levelproof.experts.generalist.train import _advantages, _kl_weight, _open_ended
-from levelproof.experts.objective import normalised, normalised_over
+from levelproof.experts.objective import normalised, normalised_over, terms
 from levelproof.experts.optimise import running_average
 from levelproof.experts.policy import divergence, log_probability
 from levelproof.levelgen.level import ACTIONS
@@ -83,6 +83,21 @@ def test_cores_normalise_the_samples_that_count_together() -> None:
     parts = jax.vmap(partial(normalised_over, "core"), axis_name="core")(advantage, jnp.broadcast_to(counts, (4, 8)))
     np.testing.assert_allclose(parts[:, counts], normalised(advantage[:, counts]), rtol=1e-5, atol=1e-6)
     assert not parts[:, 3].any()
+
+
+def test_a_weight_counts_a_sample_as_often() -> None:
+    keys = jax.random.split(jax.random.key(0), 6)
+    times = jnp.array([0, 1, 2, 3, 2])
+    logits, before, gain = (
+        jax.random.normal(key, shape) for key, shape in zip(keys, ((16, 5), (5,), (5,)), strict=False)
+    )
+    action = jnp.stack([jax.random.randint(keys[3], (5,), 0, count) for count in CHOICES])
+    live, value, advantage = jnp.ones((ACTIONS, 5), bool), jax.random.normal(keys[4], (5,)), 2 * gain
+    given = logits, value, action, live, before - 3, value + 0.3, advantage, gain
+    again = [jnp.repeat(x, times, axis=-1, total_repeat_length=8) for x in given]
+    *weighted, _ = terms(*given, clip=0.2, weight=times * 5 / 8)
+    *repeated, _ = terms(*again, clip=0.2)
+    np.testing.assert_allclose(weighted, repeated, rtol=1e-5)
 
 
 def test_kl_penalty_waits_for_the_critic_then_falls_to_zero() -> None:

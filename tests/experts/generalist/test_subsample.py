@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 
 from levelproof.experts.generalist.config import CHUNK, PPOConfig
-from levelproof.experts.generalist.subsample import EVEN, choose
+from levelproof.experts.generalist.subsample import EVEN, LEAST, choose
 
 TIMES, LANES = 8, 64
 
@@ -27,7 +27,7 @@ def test_only_what_counts_is_chosen_about_as_often_as_its_gain_asks_for(seed: in
     lane, weight = choose(gain, counts, samples, jax.random.key(seed))
     assert lane.shape == weight.shape == (TIMES, samples)
     size = np.where(counts, np.abs(gain), 0)
-    chance = np.where(counts, size + EVEN * size.mean(), 0)
+    chance = np.where(counts, size + EVEN * size.mean() + LEAST, 0)
     expected = samples * chance / chance.sum(1, keepdims=True)
     times = np.stack([np.bincount(each, minlength=LANES) for each in np.asarray(lane)])
     assert (np.abs(times - expected) < 1 + 1e-3).all()
@@ -60,7 +60,15 @@ def test_equal_gains_are_chosen_evenly() -> None:
     assert (np.diff(lane[0]) == 2).all()
     np.testing.assert_allclose(weight, 1, rtol=1e-5)
     _, weight = choose(jnp.zeros((1, LANES)), jnp.ones((1, LANES), bool), LANES // 2, jax.random.key(0))
-    assert jnp.isfinite(weight).all()
+    np.testing.assert_allclose(weight, 1, rtol=1e-5)
+
+
+def test_a_draw_that_rounds_up_to_the_total_chooses_what_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(jax.random, "uniform", lambda key, shape: jnp.full(shape, 1 - 2**-23))
+    counts = jnp.ones((1, 2048), bool).at[0, -1].set(False)
+    lane, weight = choose(jnp.ones((1, 2048)), counts, 1024, jax.random.key(0))
+    assert lane.max() == 2046
+    assert weight.max() < 1.01
 
 
 @pytest.mark.parametrize(
