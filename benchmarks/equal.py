@@ -203,9 +203,14 @@ def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
     if before >= ends[-1]:
         raise UserError(f"{way}: what comes before training takes {before:,.0f} core-seconds: raise --core-seconds.")
     for spent in (end for end in ends if end > before):
+        look, so_far = folder.with_name(f"{folder.name}-after-{spent:g}.json"), lines_of(folder)
+        if spent < ends[-1] and (look.exists() or (so_far and so_far[-1][SECONDS] > spent - before)):
+            looks += [json.loads(look.read_text())] if look.exists() else []
+            continue  # of a run that was stopped, or had fewer core-seconds
         curve = trained(args, folder, way, start, seed, spent - before)
         rates = kept(args.folder / f"{folder.name}-{curve[-1][STEPS]}-{args.measured}.json", folder, *measuring(args))
         looks.append({"planned": spent, SECONDS: before + curve[-1][SECONDS], "solved": rates[SOLVED][SAMPLED]["once"]})
+        look.write_text(json.dumps(looks[-1]) + "\n")
     lines = [*curve[:: -(-len(curve) // POINTS)], curve[-1]]
     some = [{name: line.get(name) for name in (UPDATES, STEPS, SECONDS, RATE)} for line in lines]
     return {"before": before, "curve": some, "looks": looks, "sealed": rates, "cloned": clone}

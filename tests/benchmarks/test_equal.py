@@ -1,12 +1,17 @@
 """The benchmark of learners at equal cost, on policies that train for seconds."""
 
+import json
+from argparse import Namespace
 from pathlib import Path
 
 import pytest
 
+from benchmarks import equal
 from benchmarks.__main__ import parser
-from benchmarks.equal import SECONDS, run, searched, split_of
+from benchmarks.cloning import SAMPLED
+from benchmarks.equal import RATE, SECONDS, STEPS, UPDATES, run, searched, split_of
 from levelproof import Failure, UserError
+from levelproof.pipeline.learn.evaluate import SOLVED
 from levelproof.pipeline.store.provenance import device
 
 KEPT = (
@@ -45,6 +50,26 @@ def test_page_has_the_longest_run_within_its_core_seconds(tmp_path: Path) -> Non
         table, by_cost = run(args).tables
         assert table.rows[0][3] == steps
         assert by_cost.head == ("policy", "seed", "processor", after)
+
+
+def test_run_is_never_measured_later_than_planned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that continues a shorter one keeps what that measured, and skips what it is already beyond."""
+
+    def trained(args: Namespace, policy: Path, way: str, start: str, seed: int, limit: float) -> list[dict[str, float]]:
+        policy.mkdir(exist_ok=True)
+        line = {UPDATES: 1, STEPS: int(10 * limit), SECONDS: limit - 1, RATE: 0.5}
+        (policy / "metrics.jsonl").write_text(json.dumps(line) + "\n")
+        return [line]
+
+    monkeypatch.setattr(equal, "trained", trained)
+    monkeypatch.setattr(equal, "kept", lambda file, *_: {SOLVED: {SAMPLED: {"once": {"rate": file.name}}}})
+    args = parser("equal").parse_args(["equal", "--folder", str(tmp_path)])
+    planned = {}
+    for args.core_seconds in (200, 400, 600):
+        looks = equal.measured(args, "from scratch", 0)["looks"]
+        planned[args.core_seconds] = [look["planned"] for look in looks]
+        assert all(look[SECONDS] == look["planned"] - 1 for look in looks)
+    assert planned == {200: [50, 100, 200], 400: [100, 200, 400], 600: [600]}
 
 
 @pytest.mark.campaign
