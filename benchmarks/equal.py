@@ -332,7 +332,7 @@ def row_of(name: str, cost: Sequence[str], rates: Mapping[str, Any], player: str
 def draw(results: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Plot solve rates, in training and of sealed levels, against all core-seconds, those before training included."""
     plt = pyplot()
-    figure, (training, sealed) = plt.subplots(1, 2, figsize=(9, 3.5), layout="constrained", sharex=True, sharey=True)
+    figure, (training, sealed) = plt.subplots(1, 2, figsize=(9, 4.5), layout="constrained", sharex=True, sharey=True)
     labelled = set[str]()  # ways in the legend
     for each in results:
         curve = [line for line in each["curve"] if line[UPDATES] > SETTLED and line.get(RATE)]
@@ -345,7 +345,7 @@ def draw(results: Sequence[Mapping[str, Any]], path: Path) -> None:
         sealed.plot(seconds, [100 * rate for rate in rates], color=colour, label=label, lw=1, marker="o", markersize=3)
     training.set(xlim=(0, None), xlabel="core-seconds", ylabel="reach the goal, %", title="episodes of training")
     sealed.set(xlabel="core-seconds", title="sealed levels labelled solved")
-    sealed.legend(frameon=False, loc="lower right", fontsize="small")
+    figure.legend(frameon=False, loc="outside lower center", ncols=2, fontsize="small")
     for axes in (training, sealed):
         axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, metadata={"Date": None})
