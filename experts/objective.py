@@ -93,7 +93,7 @@ def terms(
         log_before: log-probability of the action's live entries under the earlier policy.
         value_before: of the earlier value function.
         advantage: of the action.
-        gain: the advantage, `normalised` over the minibatch.
+        gain: the advantage, normalised.
         clip: maximum change of the probability ratio, and of the value.
         weight: of each sample in all means.
     """
