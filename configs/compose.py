@@ -298,6 +298,8 @@ def _changed(cls: type[T], overrides: Iterable[Override]) -> T:
     changed = dict(known)
     for override in overrides:
         key = override.key_or_group
+        if key == "out":
+            raise ConfigError("the folder to write is not a setting of this command: write -o FOLDER, not out=FOLDER.")
         if key not in known:
             raise ConfigError(f"there is no setting {key}{suggestion(key, known)}: choose one of {', '.join(known)}.")
         changed[key] = override.value()

@@ -79,7 +79,8 @@ def _no_option(word: str, takes_settings: bool) -> str:
         return f"There is no argument {word}: --help lists them."
     if word == "--debug":
         return "--debug comes after the command, as in levelproof generate --debug."
-    advice = "write settings as NAME=VALUE, as in size=m" if takes_settings else "--help lists the options"
+    example = "out=FOLDER" if word in ("-o", "--out") else "size=m"
+    advice = f"write settings as NAME=VALUE, as in {example}" if takes_settings else "--help lists the options"
     return f"There is no option {word}: {advice}."
 
 

@@ -109,6 +109,8 @@ def test_invalid_command_prints_the_usage(capsys: pytest.CaptureFixture[str], ar
     ("arguments", "message"),
     [
         (["generate", "--size", "m"], "There is no option --size: write settings as NAME=VALUE, as in size=m"),
+        (["generate", "-o", "x"], "There is no option -o: write settings as NAME=VALUE, as in out=FOLDER"),
+        (["train", "out=x"], "write -o FOLDER, not out=FOLDER"),
         (["inspect", "x", "--were", "a"], "There is no option --were: --help lists the options"),
         (["--debug", "generate"], "--debug comes after the command, as in levelproof generate --debug"),
         (["show", "x", "-o", "y.svg", "z"], "There is no argument z: --help lists them"),
