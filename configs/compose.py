@@ -48,7 +48,7 @@ def compose_job(overrides: Sequence[str]) -> JobConfig:
     names = {_parse(text).key_or_group.partition(".")[0] for text in overrides} if job.level_files else ()
     for name in FOR_RANDOM_LEVELS:
         if name in names:
-            raise ConfigError(f"{name} is for random levels, level_files for others: leave out one of the two.")
+            raise ConfigError(f"{name} is for random levels, but level_files is set: leave out one of them.")
     return job
 
 

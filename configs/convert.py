@@ -25,7 +25,7 @@ SCALARS = {  # name for messages, and types of accepted values: a string setting
     bool: ("true or false", (bool,)),
     int: ("a whole number", (int,)),
     float: ("a number", (int, float)),
-    str: ("a word", (int, float, str)),
+    str: ("text", (int, float, str)),
 }
 
 

@@ -103,7 +103,9 @@ class JobConfig:
         self._check_size()
         last = self.first_level + parse_count(self.levels, "levels") - 1
         if self.first_level < 0 or last > MAX_LEVEL_ID:
-            raise ConfigError(f"level ids {self.first_level} to {last} do not fit: they run from 0 to {MAX_LEVEL_ID}.")
+            raise ConfigError(
+                f"first_level and levels give ids {self.first_level} to {last}: keep them from 0 to {MAX_LEVEL_ID}."
+            )
         self._check_budget()
         if self.unit is not None and self.unit < 1:
             raise ConfigError(f"unit is {self.unit}: a work unit needs at least 1 level.")
@@ -121,7 +123,7 @@ class JobConfig:
         size = size_of(self.size)
         check_size(size)
         if size.bodies > MAX_BODIES:
-            raise ConfigError(f"size is {self.size}: experts train among at most {MAX_BODIES} polygons and circles.")
+            raise ConfigError(f"size is {self.size}: a level has at most {MAX_BODIES} polygons and circles.")
         if not self.level_files and not control_weights(size, self.distribution):
             raise ConfigError(
                 f"size is {self.size}: it has no room for the actuators that {', '.join(CONTROL_WEIGHTS)} in "

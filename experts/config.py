@@ -47,7 +47,7 @@ class ExpertConfig:
     horizon: int = 64  # env steps in each lane between updates
     dense_reward_scale: float = 0.2  # 1/m; shaping reward in training, in place of task.dense_reward_scale
     rehearsals: int = 8  # lanes that repeat the first success, once there is one
-    persistence: float = 0.9  # probability that these lanes repeat their last action until the first success
+    persistence: float = 0.9  # probability that rehearsal lanes repeat their last action until the first success
     # PPO (Schulman et al. 2017, arXiv:1707.06347)
     epochs: int = 4  # passes over the samples of an update
     minibatches: int = 4  # updates of the weights in an epoch
@@ -68,7 +68,7 @@ class ExpertConfig:
     witness: Choice = Choice.RECORD  # successes of an evaluation that can become a level's witness
     exploration: bool = True  # trained levels: if no evaluation succeeds, accept a success from search or training
     replays: int = (
-        32  # per candidate witness, from starts perturbed by a rounding error; 0: the first candidate becomes it
+        32  # replays per candidate witness, from starts that differ by rounding; 0: the first candidate is the witness
     )
     # machine
     slots: int = 0  # experts that train side by side in one program; 0: chosen by device

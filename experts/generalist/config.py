@@ -36,7 +36,7 @@ class PPOConfig:
     # with start=POLICY
     critic_updates: int = 10  # first updates, which fit the value function and leave the policy as it is
     kl_weight: float = 0.0  # weight of the divergence from the start, a penalty in the loss; falls linearly to 0
-    kl_updates: int = 60  # updates after the critic's over which the penalty falls to 0
+    kl_updates: int = 60  # updates after critic_updates over which kl_weight falls to 0
 
     def __post_init__(self) -> None:
         require(self, ("env_steps", "environments", "horizon", "epochs", "minibatches"), 1)

@@ -40,7 +40,7 @@ class Distribution:
     min_radius: float = 0.1  # m, smallest radius of a circle (util.sample_dimensions)
     circle_size_factor: float = 0.8  # multiplies max_size for circles [circle_max_size_coeff]
     long_side_chance: float = 0.3  # chance that one side of a rectangle is lengthened [large_rect_dim_chance]
-    long_side_factor: float = 2.0  # multiplies the length of that side [large_rect_dim_scale]
+    long_side_factor: float = 2.0  # factor by which a rectangle's long side is lengthened [large_rect_dim_scale]
 
     # Free bodies
     opposite_sides_chance: float = 0.5  # chance that green starts left and blue right [goal_body_opposide_side_chance]

@@ -8,8 +8,8 @@ from levelproof.pipeline.errors import UserError
 
 SUMMARY = "train one policy for all levels on the witnesses of splits"
 EXAMPLE = """\
-levelproof clone data/128k/s -o policy/
-levelproof clone data/128k/s data/128k/m train.updates=50k network.width=64"""
+levelproof clone manifests/16k/s -o policy/ train.updates=3500
+levelproof clone manifests/16k/s manifests/16k/m -o both/ train.updates=50k network.width=64"""
 HELP = "splits (folders or URLs), and settings to change as NAME=VALUE; docs/train.md lists them"
 
 

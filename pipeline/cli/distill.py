@@ -9,7 +9,7 @@ from levelproof.pipeline.errors import UserError
 SUMMARY = "train one policy on labels that teachers give at its own states"
 EXAMPLE = """\
 levelproof distill data/128k/s start=policy/ -o distilled/
-levelproof distill data/128k/s start=builtin:s witnesses=0 teachers.witness=0 teachers.random=0 -o distilled/"""
+levelproof distill masters/256k/s states=0 demonstrations=128 -o shown/"""
 HELP = "a split (folder or URL), and settings to change as NAME=VALUE; docs/distill.md lists them"
 
 

@@ -13,7 +13,7 @@ levelproof evaluate policy/ --on data/128k/s --where "label = 'solved'" --start 
 levelproof evaluate policy/ --on handmade
 levelproof evaluate policy/ --against builtin:s --on data/128k/s
 levelproof evaluate my_agent.py --attempts 4
-levelproof evaluate policy/ --on sealed/64k/s --experts sealed/16k/s sealed/64k/s
+levelproof evaluate policy/ --on data/128k/s --experts data/128k/s
 levelproof evaluate --on my-levels --json"""
 ON = (
     "split (folder or URL), level file or folder of them; `sealed`: 2,048 levels that are never trained on (default); "

@@ -85,7 +85,7 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.actions and arguments.format != "minari":
         raise UserError(f"--actions is for --format minari: leave it out for {arguments.format}.")
     if (arguments.levels is not None or arguments.without_levels) and arguments.format != "seed":
-        raise UserError("--levels and --without-levels are for --format seed: leave them out, or set it.")
+        raise UserError("--levels and --without-levels are for --format seed: leave them out, or add --format seed.")
     if arguments.format == JSON:
         if level_id is None or where is not None:
             raise UserError(

@@ -50,6 +50,6 @@ def _seal_to_seed(arguments: argparse.Namespace) -> None:
         raise UserError("--rows does not apply to --density seed, which writes one file: leave it out.")
     if arguments.out is None:
         raise UserError(
-            "A seed file does not take a split's place: name the file to write with -o, as in -o levels.parquet."
+            "--density seed leaves the split as it is: name the file to write with -o, as in -o levels.parquet."
         )
     export_seed(arguments.split, None, arguments.out)

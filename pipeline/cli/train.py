@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-SUMMARY = "train one policy by reinforcement on many levels, from scratch or from another policy"
+SUMMARY = "train one policy by reinforcement learning on many levels, from scratch or from another policy"
 EXAMPLE = """\
 levelproof train size=s -o agent/
 levelproof train size=m start=policy/ levels=learnability ppo.env_steps=100M -o tuned/

@@ -64,7 +64,7 @@ class TrajectoryRows:
         manifest = require_manifest(split, columns, compact=True)
         rows = select(manifest.table.filter(pc.is_valid(manifest.table["shard"])), where)  # pyright: ignore[reportAttributeAccessIssue]
         if not rows.num_rows:
-            what = "has no trajectories yet" if where is None else f"has no trajectories for which {where}"
+            what = "has no trajectories yet" if where is None else f"has no trajectories for which {where} holds"
             raise UserError(f"The split {split} {what}: `levelproof inspect {split}` shows what it has.")
         rows = rows.cast(schema_of(rows.column_names))  # dictionary-encoded only while all rows were in memory
         self.table: pa.Table = rows.combine_chunks()

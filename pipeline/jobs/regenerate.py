@@ -63,9 +63,9 @@ def split_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]
     values = {name: value for name, _, value in (argument.partition("=") for argument in arguments)}
     own = {name: values[name] for name in OWN if name in values}
     if "manifest" not in own:
-        raise UserError(f"The manifest is missing: name the split of the levels, {HINT}.")
+        raise UserError(f"No manifest was given: name the split of the levels, {HINT}.")
     if "budget" not in values:
-        raise UserError(f"The budget is missing: set it, {HINT}.")
+        raise UserError(f"No budget was given: set it, {HINT}.")
     for name in FIXED:
         if any(key.partition(".")[0] == name for key in values):
             raise UserError(f"{name} cannot be changed, because the manifest decides it: choose levels with where=SQL.")

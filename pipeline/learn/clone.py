@@ -89,7 +89,7 @@ def clone(splits: Sequence[Path], config: CloneConfig, out: Path, console: Conso
         finally:
             metrics.close(done)
         save(state)
-    tell(f"The policy is in {out}. Next: levelproof.load_policy({str(out)!r}), as docs/train.md shows.")
+    tell(f"The policy is in {out}. Next: levelproof evaluate {out}")
 
 
 def source_of(split: Path, config: CloneConfig, tell: Callable[[str], None]) -> PartedSplit:
@@ -107,7 +107,10 @@ def source_of(split: Path, config: CloneConfig, tell: Callable[[str], None]) -> 
     train, kept = (np.flatnonzero(usable & in_subset(hashes, part, config.validation)) for part in (TRAIN, VALIDATION))
     if not len(train) or not len(kept):
         count = len(data) - copies
-        raise UserError(f"{split} has too few levels ({count}) for validation={config.validation}: add levels.")
+        raise UserError(
+            f"{split} has too few levels ({count}) for validation={config.validation}: name a larger split, or change "
+            "where or validation."
+        )
     return PartedSplit(data, train, kept, copies)
 
 

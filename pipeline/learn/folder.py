@@ -20,6 +20,7 @@ from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs.progress import LINE_EVERY, say
 from levelproof.pipeline.store.disk import NotRegular, read_regular
 from levelproof.pipeline.store.files import write
+from levelproof.pipeline.store.manifest import changes_text, differences
 from levelproof.pipeline.store.provenance import device, versions
 
 CHECKPOINT, RUN = "checkpoint.safetensors", "run.json"
@@ -44,8 +45,11 @@ def require_same_run(out: Path, note: dict[str, Any], free: Sequence[str] = ()) 
     if (before := note_in(out)) is None:
         if (out / CONFIG).exists():
             raise UserError(f"{out} has a policy already: choose another folder with -o.")
-    elif _without(_without(before, (MADE_BY,)), free) != _without(note, free):
-        raise UserError(f"{out} has a run with other settings or levels: repeat its command, or choose another -o.")
+    elif changes := differences(_without(_without(before, (MADE_BY,)), free), _without(note, free)):
+        named = changes_text({name.removeprefix("settings."): change for name, change in changes.items()})
+        raise UserError(
+            f"{out} has a run with other settings or levels ({named}): repeat its command, or choose another -o."
+        )
 
 
 def with_stack(out: Path, note: dict[str, Any], tell: Callable[[str], None]) -> dict[str, Any]:

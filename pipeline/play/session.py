@@ -233,8 +233,8 @@ def require_playable(file: LevelFile) -> LevelFile:
     """Return the file. Raise UserError if an env step of its rules would take too long to play."""
     if (steps := file.rules.frame_skip) > MAX_FRAME_SKIP:
         raise UserError(
-            f"This level's rules take {steps:,} physics steps per env step, and the player at most {MAX_FRAME_SKIP}: "
-            "choose another level, or lower its frame_skip."
+            f"This level's rules take {steps:,} physics steps per env step, but the player allows at most "
+            f"{MAX_FRAME_SKIP}: choose another level, or lower its frame_skip."
         )
     return file
 

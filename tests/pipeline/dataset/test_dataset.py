@@ -226,7 +226,7 @@ def test_batches_and_grain_reject_invalid_arguments(data: Dataset, arguments: di
 def test_open_read_and_state_reject_invalid_arguments(split: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="There is no split at"):
         open(tmp_path / "nothing")
-    with pytest.raises(UserError, match="has no trajectories for which level_id < 0: `levelproof inspect"):
+    with pytest.raises(UserError, match="has no trajectories for which level_id < 0 holds: `levelproof inspect"):
         open(split, "level_id < 0")
     with pytest.raises(UserError, match=r"Cannot use the condition .*lable"):
         open(split, "lable = 'solved'")

@@ -119,8 +119,8 @@ def test_generate_deletes_experts_of_a_dead_attempt(folder: Path, tmp_path: Path
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["budget=1M"], "The manifest is missing"),
-        (["manifest=data/8k/s"], "The budget is missing"),
+        (["budget=1M"], "No manifest was given"),
+        (["manifest=data/8k/s"], "No budget was given"),
         (["manifest=data/8k/s", "budget=1M", "levels=5"], "levels cannot be changed"),
         (["manifest=data/8k/s", "budget=1M", "distribution=vehicles"], "distribution cannot be changed"),
         (["manifest=data/8k/s", "budget=1M", "distribution.max_size=0.5"], "distribution cannot be changed"),

@@ -80,7 +80,7 @@ def test_run_that_another_stack_began_continues_and_says_so(tmp_path: Path) -> N
     require_same_run(tmp_path, {"seed": 0})
     assert with_stack(tmp_path, {"seed": 0}, told.append)[MADE_BY] == [stack | {"jax": "0.9"}, stack]
     assert told == ["This run was begun with jax 0.9, so its policy will differ from that of an uninterrupted run."]
-    with pytest.raises(UserError, match="has a run with other settings or levels"):
+    with pytest.raises(UserError, match=r"has a run with other settings or levels \(seed was 0, now 1\): repeat"):
         require_same_run(tmp_path, {"seed": 1})
     for damage in ("jax", ["jax"], {"jax": "0.9"}):
         write_note(tmp_path, {"seed": 0, MADE_BY: damage})

@@ -220,7 +220,9 @@ def test_level_whose_steps_take_minutes_is_refused(page: ClientConnection, tmp_p
     document["static_env_params"]["frame_skip"] = 1_000_000
     document["witness"] = {"actions": [[0] * 6] * RECORD_STEPS}
     path.write_text(json.dumps(document))
-    with pytest.raises(UserError, match="take 1,000,000 physics steps per env step, and the player at most 8: choose"):
+    with pytest.raises(
+        UserError, match="take 1,000,000 physics steps per env step, but the player allows at most 8: choose"
+    ):
         level_to_play(path, None, None)
     assert "lower its frame_skip" in ask(page, "load", document=document)["error"]
 
