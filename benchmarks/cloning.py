@@ -27,6 +27,7 @@ from levelproof.levelgen.level import name_of
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.learn.evaluate import ALL, SOLVED
 from levelproof.pipeline.runtime import own_cores
+from levelproof.pipeline.store.files import write
 from levelproof.pipeline.store.manifest import require_manifest
 
 LEVELS, SEEDS, UPDATES, ATTEMPTS = (100, 1000, 5000), 2, 1000, 8
@@ -134,7 +135,7 @@ def kept(file: Path, policy: Path | str, *words: Any) -> dict[str, Any]:
     told = hashlib.sha256(" ".join(map(str, words)).encode() + (weights.read_bytes() if weights.exists() else b""))
     file = file.with_stem(f"{file.stem}-{told.hexdigest()[:8]}")
     if not file.exists():
-        file.write_text(command("evaluate", policy, *words, "--json"))
+        write(file, command("evaluate", policy, *words, "--json").encode())
     return json.loads(file.read_text())["levels"][0]["of"]
 
 
@@ -166,7 +167,8 @@ def timed_command(*words: Any) -> tuple[str, float]:
         for file in (output, errors):
             file.seek(0)
         if process.returncode:
-            raise Failure(f"levelproof {words[0]} failed: {errors.read().strip().splitlines()[-1]}")
+            said = errors.read().strip().splitlines() or [f"exit code {process.returncode}"]
+            raise Failure(f"levelproof {words[0]} failed: {said[-1]}")
         return output.read(), used.ru_utime + used.ru_stime
 
 
@@ -184,7 +186,7 @@ def timed_split(out: Path, *words: Any) -> float:
         if out.exists():
             raise Failure(f"{out} was left by a run that was stopped: remove it, so that its search counts as a whole.")
         seconds = timed_command("generate", *words, f"out={out}", "executor=inline")[1]
-        file.write_text(json.dumps({"settings": told, "core_seconds": seconds}))
+        write(file, json.dumps({"settings": told, "core_seconds": seconds}).encode())
     made = json.loads(file.read_text())
     if made["settings"] != told:
         raise UserError(f"{out} was made with {made['settings']}, not with {told}: choose another --folder.")

@@ -25,6 +25,7 @@ from benchmarks.teaching import DISTILLING
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.learn.evaluate import ALL, SOLVED
 from levelproof.pipeline.runtime import own_cores
+from levelproof.pipeline.store.files import write
 from levelproof.pipeline.store.provenance import device
 
 FINISHED = Path(__file__).parent / "results" / "equal"  # a file for each finished run
@@ -184,7 +185,7 @@ def finished(args: argparse.Namespace, way: str, seed: int) -> Path:
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
         made = {"device": device(), "date": datetime.now(UTC).isoformat(timespec="seconds")}
-        file.write_text(json.dumps(about | made | measured(args, way, seed), indent=1) + "\n")
+        write(file, (json.dumps(about | made | measured(args, way, seed), indent=1) + "\n").encode())
     return file
 
 
@@ -205,12 +206,17 @@ def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
     for spent in (end for end in ends if end > before):
         look, so_far = folder.with_name(f"{folder.name}-after-{spent:g}.json"), lines_of(folder)
         if spent < ends[-1] and (look.exists() or (so_far and so_far[-1][SECONDS] > spent - before)):
-            looks += [json.loads(look.read_text())] if look.exists() else []
+            looks += (
+                [old] if look.exists() and (old := json.loads(look.read_text())).get("levels") == args.measured else []
+            )
             continue  # of a run that was stopped, or had fewer core-seconds
         curve = trained(args, folder, way, start, seed, spent - before)
         rates = kept(args.folder / f"{folder.name}-{curve[-1][STEPS]}-{args.measured}.json", folder, *measuring(args))
-        looks.append({"planned": spent, SECONDS: before + curve[-1][SECONDS], "solved": rates[SOLVED][SAMPLED]["once"]})
-        look.write_text(json.dumps(looks[-1]) + "\n")
+        solved = rates[SOLVED][SAMPLED]["once"]
+        looks.append(
+            {"planned": spent, "levels": args.measured, SECONDS: before + curve[-1][SECONDS], "solved": solved}
+        )
+        write(look, (json.dumps(looks[-1]) + "\n").encode())
     lines = [*curve[:: -(-len(curve) // POINTS)], curve[-1]]
     some = [{name: line.get(name) for name in (UPDATES, STEPS, SECONDS, RATE)} for line in lines]
     return {"before": before, "curve": some, "looks": looks, "sealed": rates, "cloned": clone}

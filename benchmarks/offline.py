@@ -4,6 +4,7 @@ A stopped run resumes: the folder keeps trained networks and finished evaluation
 """
 
 import argparse
+import json
 import os
 import shutil
 import subprocess
@@ -15,8 +16,9 @@ from typing import Any
 from benchmarks.cloning import SAMPLED, children_seconds, command, interval_text, kept
 from benchmarks.learners import lines_of, slug
 from benchmarks.report import Report, Table
-from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.learn.evaluate import AGENT, SOLVED
+from levelproof.pipeline.store.files import write
 
 SCRIPT = Path(__file__).parents[1] / "docs" / "learners" / "offline_torchrl.py"
 METHODS = {  # name: the script's word for it
@@ -45,6 +47,7 @@ def register(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> Report:
+    require_same_data(args)
     data = exported(args)
     results = [learned(args, data, way, seed) for way in args.ways for seed in range(args.seeds)]
     rows = [row_of(each) for each in results]
@@ -65,6 +68,16 @@ def run(args: argparse.Namespace) -> Report:
             "Core-seconds are CPU time of training, with reading and compiling.",
         ],
     )
+
+
+def require_same_data(args: argparse.Namespace) -> None:
+    """Raise UserError if the folder holds what other levels or updates gave: it would be taken for these."""
+    told, file = json.dumps([str(args.split), args.where, args.updates]), args.folder / "settings.json"
+    if not file.exists():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write(file, told.encode())
+    if (made := file.read_text()) != told:
+        raise UserError(f"{args.folder} was made with {made}, not with {told}: choose another --folder.")
 
 
 def exported(args: argparse.Namespace) -> str:
@@ -90,7 +103,7 @@ def learned(args: argparse.Namespace, data: str, way: str, seed: int) -> dict[st
             folder.mkdir(exist_ok=True)
             shutil.copy(SCRIPT, policy)
             seconds = trained(policy, args.folder / MINARI, METHODS[way], data, args.updates, seed)
-            (folder / SECONDS).write_text(str(seconds))
+            write(folder / SECONDS, str(seconds).encode())
     words = "--attempts", ATTEMPTS, "--levels", args.measured
     sealed = kept(folder / "sealed.json", policy, *words)
     seconds = lines_of(folder)[-1]["bc/core_seconds"] if way in CLONES else float((folder / SECONDS).read_text())
@@ -108,7 +121,8 @@ def trained(script: Path, datasets: Path, *words: Any) -> float:
         check=False,
     )
     if done.returncode:
-        raise Failure(f"{script} failed: {done.stderr.strip().splitlines()[-1]}")
+        said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+        raise Failure(f"{script} failed: {said[-1]}")
     return children_seconds() - before
 
 

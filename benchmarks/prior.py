@@ -55,6 +55,8 @@ def run(args: argparse.Namespace) -> Report:
     prepare_jax()
     policy = policy_at(args.policy)
     results = [measured(policy, split, args.attempts, args.levels) for split in args.splits]
+    if unsolved := [split for one, split in zip(results, args.splits, strict=True) if not one["solved"]]:
+        raise UserError(f"No level of {unsolved[0]} is solved, so none has a cost: take more with --levels.")
     found, saved = [], []
     for one in results:
         found.append(

@@ -31,6 +31,7 @@ from levelproof.experts.imitation import ImitationConfig
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.learn.evaluate import SOLVED
 from levelproof.pipeline.runtime import own_cores
+from levelproof.pipeline.store.files import write
 from levelproof.pipeline.store.manifest import require_manifest
 
 FIRST, ATTEMPTS = 50_000, 8  # id of the first level; attempts at each sealed level
@@ -173,6 +174,8 @@ def generated(args: argparse.Namespace, name: str, cost: float | None) -> dict[s
     split = split_in(out, words)
     rows = require_manifest(split, ["level_id", "label", "steps_to_goal"]).table.to_pylist()
     steps = {row["level_id"]: row["steps_to_goal"] for row in rows if row["label"] == "solved"}
+    if not steps:
+        raise UserError(f"No level of {split} is solved: raise {'--cost' if cost else '--levels'}.")
     return {"split": split, "steps": steps, "core_seconds": spent}
 
 
@@ -193,7 +196,7 @@ def grown(out: Path, cost: float, levels: int, *words: str) -> float:
         until = done + (max(1, round((cost - spent) / (parts[-1][1] / (done - begun)))) if parts else levels)
         seconds = timed_command("generate", *words, f"levels={until}", f"out={out}", "executor=inline")[1]
         parts.append([until, seconds])
-        file.write_text(json.dumps(parts))
+        write(file, json.dumps(parts).encode())
     return spent
 
 

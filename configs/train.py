@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from levelproof.experts.generalist.config import CurriculumConfig, EvolveConfig, PPOConfig, ReplayConfig
+from levelproof.experts.generalist.config import EvolveConfig, LearnabilityConfig, PPOConfig, ReplayConfig
 from levelproof.experts.networks.over_levels import NetworkConfig
 from levelproof.physics.bounds import require
 
@@ -29,7 +29,7 @@ class TrainConfig:
     log: Literal["none", "tensorboard", "wandb"] = "none"  # logger of scalars, besides metrics.jsonl
     network: NetworkConfig = field(default_factory=NetworkConfig)  # network of a policy from scratch
     ppo: PPOConfig = field(default_factory=PPOConfig)  # training of the policy
-    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)  # choice of levels by learnability
+    curriculum: LearnabilityConfig = field(default_factory=LearnabilityConfig)  # choice of levels by learnability
     replay: ReplayConfig = field(default_factory=ReplayConfig)  # choice of levels by replay, and by evolve
     evolve: EvolveConfig = field(default_factory=EvolveConfig)  # new levels with levels=evolve
 

@@ -4,7 +4,7 @@ Schulman et al. 2017 (arXiv:1707.06347) with clipped values and normalised advan
 those of a policy for all levels over a whole update.
 """
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,15 +13,6 @@ from jaxtyping import Array, Bool, Float, Int
 from levelproof.experts.policy import entropy, log_probability
 
 ADVANTAGE_EPSILON = 1e-8
-
-
-class Discounting(Protocol):
-    """Settings of advantage estimates."""
-
-    @property
-    def discount(self) -> float: ...
-    @property
-    def gae_lambda(self) -> float: ...
 
 
 class Terms(NamedTuple):
@@ -38,7 +29,8 @@ def advantages(
     reward: Float[Array, "time ..."],
     done: Array,
     last_value: Float[Array, "..."],
-    config: Discounting,
+    discount: float,
+    gae_lambda: float,
 ) -> Float[Array, "time ..."]:
     """Estimate generalised advantages (Schulman et al. 2016, arXiv:1506.02438).
 
@@ -49,8 +41,8 @@ def advantages(
     def back(carry, now):
         advantage, next_value = carry
         value, reward, alive = now
-        surprise = reward + config.discount * next_value * alive - value
-        advantage = surprise + config.discount * config.gae_lambda * alive * advantage
+        surprise = reward + discount * next_value * alive - value
+        advantage = surprise + discount * gae_lambda * alive * advantage
         return (advantage, value), advantage
 
     start = (jnp.zeros_like(last_value), last_value)

@@ -1,4 +1,4 @@
-"""An expert's policy: multi-discrete logits and a value, from its observation of a state."""
+"""Distributions over actions, for all policies; and experts' networks, from an observation to logits and a value."""
 
 from typing import Any
 

@@ -101,7 +101,7 @@ class PPOConfig:
 
 
 @dataclass(frozen=True)
-class CurriculumConfig:
+class LearnabilityConfig:
     """Settings of the curriculum by learnability (hashable: pass as a static argument)."""
 
     share: float = 0.75  # share of episodes in levels that the measurement kept, however few; the others draw from all

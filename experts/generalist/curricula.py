@@ -54,4 +54,9 @@ def fresh(table: Table, key: Key[Array, ""], lanes: int) -> Int[Array, " lane"]:
     return jax.random.randint(key, (lanes,), 0, table.start.timestep.shape[-1])
 
 
+def chance(share: float, key: Key[Array, ""], lanes: int) -> Bool[Array, " lane"]:
+    """Draw which lanes belong to a share of all, each independently."""
+    return jax.random.uniform(key, (lanes,)) < share
+
+
 UNIFORM = Curriculum(lambda: (), lambda table, state, key, lanes: fresh(table, key, lanes))

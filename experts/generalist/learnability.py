@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, Key
 
-from levelproof.experts.generalist.config import CurriculumConfig
-from levelproof.experts.generalist.curricula import Attempt, Curriculum, fresh
+from levelproof.experts.generalist.config import LearnabilityConfig
+from levelproof.experts.generalist.curricula import Attempt, Curriculum, chance, fresh
 from levelproof.levelgen.task.lanes import Table
 
 
@@ -30,7 +30,7 @@ def by_level(candidates: Int[Array, " candidate"], *counts: Int[Array, " candida
 
 
 @cache
-def learnability(config: CurriculumConfig) -> Curriculum:
+def learnability(config: LearnabilityConfig) -> Curriculum:
     """Return the curriculum.
 
     Every `every` updates the policy attempts levels drawn uniformly, which are fresh ones if levels are random. Those
@@ -41,7 +41,7 @@ def learnability(config: CurriculumConfig) -> Curriculum:
     def draw(table: Table, state: Learnable, key: Key[Array, ""], lanes: int) -> Int[Array, " lane"]:
         of_fresh, of_share, of_choice = jax.random.split(key, 3)
         chosen = state.level_index[jax.random.randint(of_choice, (lanes,), 0, jnp.maximum(state.usable, 1))]
-        takes = (jax.random.uniform(of_share, (lanes,)) < config.share) & (state.usable > 0)
+        takes = chance(config.share, of_share, lanes) & (state.usable > 0)
         return jnp.where(takes, chosen, fresh(table, of_fresh, lanes))
 
     def measure(table: Table, attempt: Attempt, key: Key[Array, ""]) -> Learnable:

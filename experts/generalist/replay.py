@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from levelproof.experts.generalist.config import ReplayConfig
-from levelproof.experts.generalist.curricula import Curriculum, EndedEpisodes, fresh
+from levelproof.experts.generalist.curricula import Curriculum, EndedEpisodes, chance, fresh
 from levelproof.levelgen.task.lanes import FIRST_EXTRA, Table
 
 EMPTY = -1  # index of a slot's level
@@ -47,10 +47,6 @@ def empty(config: ReplayConfig) -> ReplayBuffer:
     whole = lambda value: jnp.full(config.capacity, value, jnp.int32)
     real = lambda value: jnp.full(config.capacity, value, jnp.float32)
     return ReplayBuffer(whole(EMPTY), real(-jnp.inf), real(-jnp.inf), whole(0), whole(0))
-
-
-def chance(share: float, key: Key[Array, ""], lanes: int) -> Bool[Array, " lane"]:
-    return jax.random.uniform(key, (lanes,)) < share
 
 
 def replayed(buffer: ReplayBuffer, key: Key[Array, ""], lanes: int) -> tuple[Int[Array, " lane"], Bool[Array, ""]]:

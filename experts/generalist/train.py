@@ -151,7 +151,7 @@ def _advance(
 ) -> tuple[Learner, UpdateFacts]:
     """Act in a core's lanes, and take one update together with the other cores."""
     ppo, update = recipe.ppo, learner.updates
-    key = jax.random.fold_in(_key(recipe, update), jax.lax.axis_index(CORES))
+    key = jax.random.fold_in(_key(recipe, PLAYING, update), jax.lax.axis_index(CORES))
     of_rollout, of_choice, of_epochs = jax.random.split(key, 3)
     table = recipe.curriculum.table(table, learner.curriculum)
     draw = partial(recipe.curriculum.draw, table, learner.curriculum)
@@ -193,8 +193,8 @@ def _advantages(experience: Experience, config: PPOConfig) -> Float[Array, "time
     open_ended = _open_ended(experience)
     reward = jnp.where(open_ended, experience.value, experience.reward)
     over = experience.done | open_ended
-    per_action = replace(config, discount=config.discount**config.repeat)
-    return advantages(experience.value, reward, over, jnp.zeros_like(reward[0]), per_action)
+    per_action = config.discount**config.repeat
+    return advantages(experience.value, reward, over, jnp.zeros_like(reward[0]), per_action, config.gae_lambda)
 
 
 def _samples(ppo: PPOConfig, experience: Experience, key: Key[Array, ""]) -> Chunk:
@@ -297,9 +297,9 @@ def _kl_weight(config: PPOConfig, update: Array) -> Float[Array, ""]:
     return config.kl_weight * jnp.maximum(1 - since / max(config.kl_updates, 1), 0.0)
 
 
-def _key(recipe: TrainingRecipe, update: Array) -> Key[Array, ""]:
-    """Derive the key of an update."""
-    return jax.random.fold_in(jax.random.fold_in(key_of_seed(recipe.seed), PLAYING), update)
+def _key(recipe: TrainingRecipe, purpose: int, update: Array) -> Key[Array, ""]:
+    """Derive the key of what happens in, or before, an update."""
+    return jax.random.fold_in(jax.random.fold_in(key_of_seed(recipe.seed), purpose), update)
 
 
 def _measure(recipe: TrainingRecipe, learner: Learner, table: Table) -> Learner:
@@ -325,7 +325,7 @@ def _measure(recipe: TrainingRecipe, learner: Learner, table: Table) -> Learner:
         gather = lambda x: jax.lax.all_gather(x, CORES, axis=0, tiled=True)[: len(level_index)]
         return jax.tree.map(gather, counts)
 
-    key = jax.random.fold_in(jax.random.fold_in(key_of_seed(recipe.seed), MEASURING), learner.updates)
+    key = _key(recipe, MEASURING, learner.updates)
     return learner._replace(curriculum=curriculum.measure(table, attempt, key))
 
 

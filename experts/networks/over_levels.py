@@ -59,6 +59,10 @@ class NetworkConfig:
         if self.kind is PolicyKind.TRANSFORMER and self.heads % MASKS:
             raise ValueError(f"heads is {self.heads}: it must be a multiple of {MASKS} for the transformer")
 
+    def only_size(self, size: Size) -> Size | None:
+        """Return the one size that a network trained on levels of `size` fits; None: it fits any."""
+        return size if self.kind is PolicyKind.FLAT else None
+
     @property
     def observation_type(self) -> ObservationType:
         """What the network reads of a state, as an observation of the environment."""

@@ -111,7 +111,9 @@ def sample_rows(
     config: ExpertConfig,
 ) -> Float[Array, "slot sample column"]:
     """Compute advantages; return the samples of every slot as `ppo.as_rows` lays them out, slots first."""
-    advantage = advantages(trajectory.value, trajectory.reward, trajectory.done, last_value, config)
+    advantage = advantages(
+        trajectory.value, trajectory.reward, trajectory.done, last_value, config.discount, config.gae_lambda
+    )
     rehearsed = jnp.broadcast_to(rehearsing.reshape(trajectory.value.shape[1:]), trajectory.value.shape)
     samples = Samples(
         trajectory.moving,

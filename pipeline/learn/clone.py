@@ -120,8 +120,7 @@ def size_for(sources: Sequence[PartedSplit], config: CloneConfig) -> Size:
     if len(sizes) > 1 and config.network.kind is PolicyKind.FLAT:
         names = ", ".join(map(name_of, sizes))
         raise UserError(f"network.kind=flat fits levels of one size, not of {names}: use attention or invariant.")
-    # A level with an entity of every kind initialises all parameters of a network that fits any size
-    return sizes[0] if config.network.kind is PolicyKind.FLAT else Size(5, 1, 1, 1)
+    return sizes[0]
 
 
 def note_of(sources: Sequence[PartedSplit], config: CloneConfig) -> dict[str, Any]:
@@ -136,8 +135,8 @@ def note_of(sources: Sequence[PartedSplit], config: CloneConfig) -> dict[str, An
 
 def keep(out: Path, state: Imitation, config: CloneConfig, size: Size, note: dict[str, Any]) -> None:
     """Write the checkpoint, then the policy."""
-    fits = size if config.network.kind is PolicyKind.FLAT else None
-    keep_run(out, Policy(config.network, state.average, fits, note | {"updates": int(state.updates)}), state)
+    origin = note | {"updates": int(state.updates)}
+    keep_run(out, Policy(config.network, state.average, config.network.only_size(size), origin), state)
 
 
 def train(

@@ -18,7 +18,7 @@ from levelproof.configs.distill import DistillConfig
 from levelproof.experts.generalist.teachers import no_experts
 from levelproof.experts.imitation import Imitation, Likeness, Transitions, begin_imitation, imitate
 from levelproof.experts.labels import Label
-from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind
+from levelproof.experts.networks.over_levels import NetworkConfig
 from levelproof.experts.networks.saved import Policy
 from levelproof.levelgen.batching import take
 from levelproof.pipeline.dataset.dataset import Dataset
@@ -99,10 +99,9 @@ def distill(split: Path, config: DistillConfig, out: Path, console: Console) -> 
 
         def save(now: Distillation) -> None:
             require_ours()
-            fits = size if network.kind is PolicyKind.FLAT else None
             origin = note | {"updates": int(now.imitation.updates)}
             origin |= {"start_origin": dict(start.origin)} if start else {}
-            keep_run(out, Policy(network, now.imitation.average, fits, origin), now)
+            keep_run(out, Policy(network, now.imitation.average, network.only_size(size), origin), now)
 
         try:
             now = update_until_done(taught, config, network, now, save, metrics, console)

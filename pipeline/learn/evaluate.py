@@ -99,7 +99,12 @@ def evaluate(
         about = {"policy": policy and str(policy), **others, "attempts": attempts, "seed": seed}
         json.dump(about | {"levels": facts}, sys.stdout)
         print()
-        return
+    else:
+        _print_all(facts, attempts)
+
+
+def _print_all(facts: Sequence[dict[str, Any]], attempts: int) -> None:
+    """Print the tables of all groups of levels, and what they need to be read."""
     for group in facts:
         _print(group, attempts, Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else WIDE))
     print("In brackets: 95% intervals over levels.")

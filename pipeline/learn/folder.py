@@ -82,7 +82,10 @@ def _without(note: Any, path: Sequence[str]) -> Any:
 def note_in(out: Path) -> dict[str, Any] | None:
     """Return what decides the result of the run in `out`; None: there is none. Raise Failure if it is damaged."""
     try:
-        return json.loads(read_regular(out / RUN))
+        note = json.loads(read_regular(out / RUN))
+        if not isinstance(note, dict) or type(note.get("cores", 1)) is not int:
+            raise ValueError("it does not describe a run")
+        return note
     except (FileNotFoundError, NotADirectoryError):  # `made` refuses a file
         return None
     except (OSError, ValueError, RecursionError) as error:

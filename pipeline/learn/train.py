@@ -17,7 +17,6 @@ from levelproof.experts.generalist.learnability import learnability
 from levelproof.experts.generalist.replay import replay
 from levelproof.experts.generalist.rollout import table_of
 from levelproof.experts.generalist.train import Learner, Programs, TrainingRecipe, UpdateFacts, programs_of
-from levelproof.experts.networks.over_levels import PolicyKind
 from levelproof.experts.networks.saved import Policy
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.sampling.sampler import Sampler
@@ -90,7 +89,7 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
 
         def save(learner: Learner) -> None:
             require_ours()
-            fits = source.levels.size if recipe.network.kind is PolicyKind.FLAT else None
+            fits = recipe.network.only_size(source.levels.size)
             origin = note | {"env_steps": int(learner.updates) * config.ppo.steps_per_update}
             origin |= {"start_origin": dict(start.origin)} if start else {}
             keep_run(out, Policy(recipe.network, learner.average, fits, origin), learner)

@@ -30,7 +30,7 @@ class Agent:
     """
 
     def __init__(self, name: str, act: Callable[..., Any]) -> None:
-        self.name, self._act = name, act
+        self.name, self.act = name, act
         self.error: str | None = None  # the first failure; afterwards the agent does nothing
 
     def __call__(self, params: Any, moment: Moment) -> Int[Array, "6 lane"]:
@@ -45,7 +45,7 @@ class Agent:
         if self.error is not None:
             return nothing
         try:
-            action = np.asarray(self._act(observation, live, uniform))
+            action = np.asarray(self.act(observation, live, uniform))
         except Exception as error:
             self.error = f"{ACT} of {self.name} failed: {type(error).__name__}: {error}"
             return nothing
@@ -69,11 +69,18 @@ def agent_in(file: Path) -> Agent:
     """
     if not file.is_file():
         raise UserError(f"There is no agent at {file}: name a Python file that defines {ACT}.")
-    sys.path.insert(0, str(file.parent.absolute()))  # as `python FILE` does
+    folder = file.parent.absolute()
+    sys.path.insert(0, str(folder))  # as `python FILE` does
+    before = set(sys.modules)
     try:
         act = runpy.run_path(str(file)).get(ACT)
     except (Exception, SystemExit) as error:
         raise UserError(f"{file} failed: {type(error).__name__}: {error}.") from None
+    finally:  # another agent's neighbours may have the same names
+        for name in sys.modules.keys() - before:
+            top = folder / name.partition(".")[0]
+            if top.with_suffix(".py").is_file() or (top / "__init__.py").is_file():
+                del sys.modules[name]
     if not callable(act):
         raise UserError(f"{file} defines no function {ACT}: docs/evaluate.md says what it is called with.")
     return Agent(str(file), act)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from levelproof.experts.generalist.config import CurriculumConfig, PPOConfig
+from levelproof.experts.generalist.config import LearnabilityConfig, PPOConfig
 from levelproof.experts.generalist.curricula import fresh
 from levelproof.experts.generalist.learnability import learnability
 from levelproof.experts.generalist.rollout import Experience, table_of
@@ -140,7 +140,7 @@ def test_random_levels_are_never_sealed_and_table_levels_are_all_drawn() -> None
 
 
 def test_learnability_keeps_levels_that_are_sometimes_solved() -> None:
-    config = CurriculumConfig(share=0.75, candidates=64, keep=16)
+    config = LearnabilityConfig(share=0.75, candidates=64, keep=16)
     curriculum = learnability(config)
     table, key = sampler("s"), jax.random.key(1)
     before = np.asarray(curriculum.draw(table, curriculum.begin(), key, 1000))
@@ -164,7 +164,7 @@ def test_learnability_keeps_levels_that_are_sometimes_solved() -> None:
 
 def test_learnability_adds_up_the_attempts_at_copies_of_few_levels() -> None:
     """Level 0 is solved as often as not, but each of its copies either always or never; level 1 a quarter as often."""
-    config = CurriculumConfig(candidates=64, keep=16)
+    config = LearnabilityConfig(candidates=64, keep=16)
     table = table_of(sample_levels(np.arange(5), "s"), DEFAULT_RULES)
 
     def attempt(ids, steps, key):

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import jax
@@ -28,6 +29,7 @@ from levelproof.pipeline.learn.measured import levels_in, midway_levels
 from levelproof.pipeline.learn.sealed import SEALED, known_sealed
 from levelproof.pipeline.learn.solve_rates import difference, interval, solve_rates
 from levelproof.pipeline.learn.specialists import sealed_specialists, specialists_of
+from levelproof.pipeline.read.agents import agent_in
 from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.command import ROOT, assert_refused, here, run
@@ -197,6 +199,16 @@ def test_agent_in_a_python_file_plays_as_a_player_does(tmp_path: Path) -> None:
         assert players["agent"] == players["random"]
     (look,) = (tmp_path / f"agent.{LOOKS}").read_text().splitlines()
     assert json.loads(look)["on"]["sealed s"]["solved"] == group["of"]["all"]["random"]["once"]["rate"]
+
+
+def test_agents_import_neighbours_of_the_same_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    for choice in (0, 1):
+        (folder := tmp_path / str(choice)).mkdir()
+        (folder / "net.py").write_text(f"choice = {choice}")
+        (folder / "agent.py").write_text("import net\n\n\ndef act(*seen): return net.choice")
+    zero, one = (agent_in(tmp_path / str(choice) / "agent.py") for choice in (0, 1))
+    assert (zero.act(), one.act()) == (0, 1)
 
 
 @pytest.mark.parametrize(

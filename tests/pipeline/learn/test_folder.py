@@ -16,8 +16,10 @@ from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.learn.folder import (
     CHECKPOINT,
     MADE_BY,
+    RUN,
     continued,
     keep_run,
+    note_in,
     require_same_run,
     shown,
     with_stack,
@@ -82,6 +84,10 @@ def test_run_that_another_stack_began_continues_and_says_so(tmp_path: Path) -> N
     assert told == ["This run was begun with jax 0.9, so its policy will differ from that of an uninterrupted run."]
     with pytest.raises(UserError, match=r"has a run with other settings or levels \(seed was 0, now 1\): repeat"):
         require_same_run(tmp_path, {"seed": 1})
+    for damage in ("5", '{"cores": "two"}', "{"):
+        (tmp_path / RUN).write_text(damage)
+        with pytest.raises(Failure, match=r"Cannot read .*run\.json"):
+            note_in(tmp_path)
     for damage in ("jax", ["jax"], {"jax": "0.9"}):
         write_note(tmp_path, {"seed": 0, MADE_BY: damage})
         with pytest.raises(Failure, match=r"run\.json is damaged \(made_by\)"):

@@ -11,7 +11,7 @@ from safetensors.numpy import load_file
 
 import levelproof
 from levelproof.configs.train import TrainConfig
-from levelproof.experts.generalist.config import CurriculumConfig, EvolveConfig, PPOConfig, ReplayConfig
+from levelproof.experts.generalist.config import EvolveConfig, LearnabilityConfig, PPOConfig, ReplayConfig
 from levelproof.experts.generalist.train import _programs as programs
 from levelproof.experts.networks.saved import WEIGHTS, Policy
 from levelproof.levelgen.task.lanes import FIRST_EXTRA
@@ -305,5 +305,5 @@ def test_training_starts_from_linked_weights(agent: Path, tmp_path: Path) -> Non
 
 
 def test_guides_list_every_setting_with_its_default_and_meaning() -> None:
-    groups = {"": TrainConfig(), "ppo.": PPOConfig(), "curriculum.": CurriculumConfig()}
+    groups = {"": TrainConfig(), "ppo.": PPOConfig(), "curriculum.": LearnabilityConfig()}
     assert_guide_lists(groups | {"replay.": ReplayConfig(), "evolve.": EvolveConfig()}, "finetune", "curricula")
