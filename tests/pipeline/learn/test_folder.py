@@ -84,7 +84,7 @@ def test_run_that_another_stack_began_continues_and_says_so(tmp_path: Path) -> N
     assert told == ["This run was begun with jax 0.9, so its policy will differ from that of an uninterrupted run."]
     with pytest.raises(UserError, match=r"has a run with other settings or levels \(seed was 0, now 1\): repeat"):
         require_same_run(tmp_path, {"seed": 1})
-    for damage in ("5", '{"cores": "two"}', "{"):
+    for damage in ("5", "[]", '{"cores": "two"}', "{"):
         (tmp_path / RUN).write_text(damage)
         with pytest.raises(Failure, match=r"Cannot read .*run\.json"):
             note_in(tmp_path)

@@ -287,9 +287,7 @@ def test_replay_of_too_few_levels_is_refused(split: Path, tmp_path: Path) -> Non
     )
 
 
-@pytest.mark.parametrize(
-    "note", [{"splits": [], "settings": {"where": ""}}, {"settings": {"ppo": 1}}, {"cores": 7}, []]
-)
+@pytest.mark.parametrize("note", [{"splits": [], "settings": {"where": ""}}, {"settings": {"ppo": 1}}, {"cores": 7}])
 def test_folder_with_the_note_of_another_command_is_refused(note: Any, tmp_path: Path) -> None:
     (tmp_path / "agent").mkdir()
     (tmp_path / "agent" / "run.json").write_text(json.dumps(note))
