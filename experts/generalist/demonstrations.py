@@ -17,7 +17,8 @@ from jaxtyping import Array, Bool, Float, Int, Int8, Key
 
 from levelproof.experts.config import RECORD_STEPS, ExpertConfig
 from levelproof.experts.evaluation import Moment
-from levelproof.experts.generalist.teachers import KnownExperts, Labels, Teacher, play_expert
+from levelproof.experts.generalist.attempts import play_expert
+from levelproof.experts.generalist.teachers import KnownExperts, Labels, Teacher
 from levelproof.experts.imitation import to_motion
 from levelproof.experts.noise import PERTURBATION, STICKINESS, pushed
 from levelproof.levelgen.batching import BATCHES, block_size, blocks, take

@@ -9,6 +9,7 @@ import pytest
 
 from levelproof.experts.config import RECORD_STEPS, ExpertConfig
 from levelproof.experts.evaluation import Moment
+from levelproof.experts.generalist.attempts import play_expert, recalled
 from levelproof.experts.generalist.teachers import (
     Asked,
     KnownExperts,
@@ -17,8 +18,6 @@ from levelproof.experts.generalist.teachers import (
     TeachersConfig,
     label_states,
     no_experts,
-    play_expert,
-    recalled,
 )
 from levelproof.experts.generalist.visited import draw_states, visit
 from levelproof.experts.imitation import from_motion
