@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 import levelproof
-from benchmarks.plotting import pyplot
+from benchmarks.plotting import pyplot, save
 from benchmarks.report import Report, Table
 from levelproof.experts.networks.saved import WEIGHTS, policy_folder
 from levelproof.levelgen.level import name_of
@@ -266,6 +266,4 @@ def draw(path: Path, results: list[dict[str, Any]]) -> None:
                       color=GREY)  # fmt: skip
     axes.set(xscale="log", ylim=(0, None), xlabel="solved levels cloned from", ylabel="solved in one attempt, %")
     axes.legend(frameon=False, loc="upper right")
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, metadata={"Date": None})
-    plt.close(figure)
+    save(figure, path)

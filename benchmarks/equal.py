@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from benchmarks.cloning import SAMPLED, command, interval_text, kept, lines_of, timed_split
 from benchmarks.learners import ATTEMPTS, RATE, SECONDS, STEPS, add_ways, rates_text, slug
-from benchmarks.plotting import pyplot
+from benchmarks.plotting import pyplot, save
 from benchmarks.report import Report, Table
 from benchmarks.teaching import DISTILLING
 from levelproof.pipeline.errors import UserError
@@ -352,10 +352,7 @@ def draw(results: Sequence[Mapping[str, Any]], path: Path) -> None:
     training.set(xlim=(0, None), xlabel="core-seconds", ylabel="reach the goal, %", title="episodes of training")
     sealed.set(xlabel="core-seconds", title="sealed levels labelled solved")
     figure.legend(frameon=False, loc="outside lower center", ncols=2, fontsize="small")
-    for axes in (training, sealed):
-        axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, metadata={"Date": None})
-    plt.close(figure)
+    save(figure, path)
 
 
 def looks_of(each: Mapping[str, Any]) -> list[tuple[float, float]]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.cloning import SAMPLED, command, interval_text, kept, lines_of
-from benchmarks.plotting import pyplot
+from benchmarks.plotting import pyplot, save
 from benchmarks.report import Report, Table
 from levelproof.configs.numbers import parse_count
 from levelproof.pipeline.learn.evaluate import ALL, SOLVED
@@ -123,6 +123,4 @@ def draw(results: Sequence[dict[str, Any]], path: Path) -> None:
             axes.plot(*zip(*points, strict=True), color=colour, label=way if each["seed"] == 0 else None, linewidth=1)
     axes.set(ylim=(0, None), xlabel="core-seconds", ylabel="episodes that reach the goal, %")
     axes.legend(frameon=False, loc="lower right")
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, metadata={"Date": None})
-    plt.close(figure)
+    save(figure, path)

@@ -14,7 +14,7 @@ from typing import Any
 
 from benchmarks import oracle
 from benchmarks.plan import measured
-from benchmarks.plotting import pyplot
+from benchmarks.plotting import pyplot, save
 from benchmarks.report import Report, Table
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.layout import split_path
@@ -168,6 +168,5 @@ def draw(samples: Sequence[Mapping[str, Any]], file: Path) -> None:
         for i in steps:
             axes.axvline(minutes[i], color="#cccccc", linewidth=0.8)
         axes.legend(frameon=False)
-        axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25, linewidth=0.5)
-    figure.savefig(file, metadata={"Date": None})
+    save(figure, file)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from benchmarks.plotting import pyplot
+from benchmarks.plotting import pyplot, save
 from benchmarks.reference.actions import sticky_actions
 from benchmarks.report import Report, Table
 from levelproof.levelgen.level import SIZES, Level
@@ -144,6 +144,5 @@ def draw(touching: dict, grown: list, file: Path) -> None:
     right.set(xlabel="bodies, the four of the scenery included", yscale="log")
     right.legend(frameon=False)
     for axes in (left, right):
-        axes.spines[["top", "right"]].set_visible(False)
         axes.grid(alpha=0.25, linewidth=0.5)
-    figure.savefig(file, metadata={"Date": None})
+    save(figure, file)

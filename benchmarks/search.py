@@ -19,7 +19,7 @@ from jaxtyping import Int
 from scipy.stats import chi2
 
 from benchmarks.oracle import log
-from benchmarks.plotting import pyplot
+from benchmarks.plotting import pyplot, save
 from benchmarks.report import Report, Table
 from benchmarks.statistics import wilson
 from levelproof.configs.numbers import parse_count
@@ -249,6 +249,4 @@ def draw(path: Path, steps_by_size: Mapping[str, Int[np.ndarray, " level"]], max
         axes.fill_between(budgets, low, high, color=COLOURS[size], alpha=0.15, linewidth=0)
     axes.set(xscale="log", ylim=(0, None), xlabel="env steps of search, a level", ylabel="unsolved, %")
     axes.legend(title="size", frameon=False)
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, metadata={"Date": None})
-    plt.close(figure)
+    save(figure, path)

@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 import levelproof
 from benchmarks import oracle
 from benchmarks.fresh import LANES, STEPS, in_lanes
-from benchmarks.plotting import pyplot
+from benchmarks.plotting import pyplot, save
 from benchmarks.report import RESULTS, Report, Table
 from benchmarks.storage import PUBLISHED
 from levelproof.experts.config import RECORD_STEPS
@@ -192,9 +192,7 @@ def draw(kept: Mapping[str, float], path: Path) -> None:
         axes.annotate(f"{size:,.0f}", (size, row), xytext=(3, 0), textcoords="offset points", va="center", fontsize=8)
     axes.set(xscale="log", xlim=(1, 3 * max(kept.values())), xlabel="bytes per trajectory")
     axes.invert_yaxis()
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, metadata={"Date": None})
-    plt.close(figure)
+    save(figure, path)
 
 
 def read(seeds: Path, part: Path, split: Path, seconds: float, alone: bool) -> tuple[dict[str, Any], dict[str, str]]:

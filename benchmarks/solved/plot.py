@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.plotting import save
 from benchmarks.report import Table
 from benchmarks.solved.results import Results, count, share
 from benchmarks.solved.tables import order
@@ -91,12 +92,10 @@ def draw(results: Sequence[Results], out: Path) -> None:
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: count(x)))
     axes.yaxis.set_major_formatter(PercentFormatter(1, 0))
-    axes.spines[["top", "right"]].set_visible(False)
     axes.grid(alpha=0.3, linewidth=0.5, color=GREY)
     axes.legend(frameon=False)
     out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, transparent=True, metadata={"Date": None})
-    plt.close(figure)
+    save(figure, out, transparent=True)
 
 
 def draw_curve(axes: Any, results: Results, name: str, colour: str) -> None:
