@@ -34,6 +34,7 @@ from levelproof.pipeline.learn.folder import (
     write_note,
 )
 from levelproof.pipeline.learn.metrics import Metrics
+from levelproof.pipeline.learn.pace import Pace
 from levelproof.pipeline.learn.pool import Feed, PartedSplit, validation_batches
 from levelproof.pipeline.learn.sealed import require_not_sealed, without_sealed
 from levelproof.pipeline.runtime import prepare_jax
@@ -152,8 +153,8 @@ def train(
     Raises:
         Failure: the weights have diverged.
     """
-    last, first, recent, began, aside = config.train.updates, int(state.updates), [], time.monotonic(), 0.0
-    before = metrics.last.get("bc/core_seconds", 0.0)
+    last, first, recent = config.train.updates, int(state.updates), []
+    before, pace = metrics.last.get("bc/core_seconds", 0.0), Pace()
     with shown(console, "reading levels", last, first) as show:
         feed = Feed(sources, config, lambda count: show(0, f"reading {count} levels"))
         held = {str(source.data.split): held_of(source, config) for source in sources}
@@ -161,23 +162,20 @@ def train(
             state, likeness = imitate(state, batch, config.network, config.train)
             recent.append(likeness)
             jax.block_until_ready(likeness)
-            if update == first + 1:
-                began = time.monotonic()  # reading and compiling do not count
-            rate, pace = (update - first - 1) / max(time.monotonic() - began - aside, 1e-9), ""
+            rate, speed = pace.count(1), ""
             if rate:
-                pace = f" · {rate * config.train.batch:,.0f} samples/s · about {duration((last - update) / rate)} left"
-            words, keep = f"{update:,}/{last:,} updates{pace}", update % config.interval == 0 or update == last
+                speed = f" · {rate * config.train.batch:,.0f} samples/s · about {duration((last - update) / rate)} left"
+            words, keep = f"{update:,}/{last:,} updates{speed}", update % config.interval == 0 or update == last
             if keep:
-                paused = time.monotonic()
-                numbers = {COURSE.step: update, "bc/samples_per_second": rate * config.train.batch}
-                numbers |= averages("", recent) | validated(state, held, config)
-                numbers["bc/core_seconds"] = before + time.process_time()
-                require_finite(numbers["bc/loss"], "train.learning_rate")
-                recent = []
-                metrics.write(numbers)  # before the checkpoint: a run that continues drops lines after it
-                save(state)
-                words = f"{line_of(update, last, numbers)}{pace}"
-                aside += time.monotonic() - paused
+                with pace.aside():
+                    numbers = {COURSE.step: update, "bc/samples_per_second": rate * config.train.batch}
+                    numbers |= averages("", recent) | validated(state, held, config)
+                    numbers["bc/core_seconds"] = before + time.process_time()
+                    require_finite(numbers["bc/loss"], "train.learning_rate")
+                    recent = []
+                    metrics.write(numbers)  # before the checkpoint: a run that continues drops lines after it
+                    save(state)
+                words = f"{line_of(update, last, numbers)}{speed}"
             show(1, words, keep)
     return state
 

@@ -39,6 +39,7 @@ from levelproof.pipeline.learn.folder import (
 from levelproof.pipeline.learn.kept_experts import experts_of
 from levelproof.pipeline.learn.labelled import LabelBuffer, empty_labels
 from levelproof.pipeline.learn.metrics import Metrics
+from levelproof.pipeline.learn.pace import Pace
 from levelproof.pipeline.learn.pool import read_pool
 from levelproof.pipeline.learn.rounds import TaughtLevels, teach
 from levelproof.pipeline.learn.sealed import require_not_sealed, require_some_usable, without_sealed
@@ -176,7 +177,7 @@ def update_until_done(
         Failure: the weights have diverged.
     """
     last, first = config.train.updates, int(now.imitation.updates)
-    before, began = metrics.last.get("distill/core_seconds", 0.0), time.monotonic()
+    before, pace = metrics.last.get("distill/core_seconds", 0.0), Pace()
     with shown(console, "compiling", last, first) as show:
         for update in range(first, last, config.interval):
             show(0, f"{update:,}/{last:,} updates · teachers at work")
@@ -200,11 +201,8 @@ def update_until_done(
                 else f"{numbers['distill/demonstrated']:.1%} of demonstrations reach the goal"
             )
             words = f"{until:,}/{last:,} updates · {numbers['distill/solve_rate']:.1%} solved · {by_teachers}"
-            if update == first:
-                began = time.monotonic()  # compiling does not count
-            else:
-                pace = (time.monotonic() - began) / (until - first - config.interval)
-                words += f" · about {duration((last - until) * pace)} left"
+            if rate := pace.count(until - update):
+                words += f" · about {duration((last - until) / rate)} left"
             metrics.write(numbers)  # before the checkpoint: a run that continues drops lines after it
             save(now)
             show(until - update, words, keep=True)

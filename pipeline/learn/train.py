@@ -38,6 +38,7 @@ from levelproof.pipeline.learn.folder import (
     write_note,
 )
 from levelproof.pipeline.learn.metrics import Metrics
+from levelproof.pipeline.learn.pace import Pace
 from levelproof.pipeline.learn.trained_on import TrainingLevels, levels_for
 from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.runtime import own_cores, prepare_jax
@@ -175,7 +176,7 @@ def update_until_done(
         Failure: the weights have diverged.
     """
     last, first, per_update = recipe.ppo.updates, int(learner.updates), recipe.ppo.steps_per_update
-    before, began, aside, recent = metrics.last.get("train/core_seconds", 0.0), time.monotonic(), 0.0, []
+    before, pace, recent = metrics.last.get("train/core_seconds", 0.0), Pace(), []
     every = recipe.curriculum.every
     with shown(console, "compiling", last, first) as show:
         for update in range(first + 1, last + 1):
@@ -183,9 +184,7 @@ def update_until_done(
                 learner = programs.between_updates(learner, table)
             learner, facts = programs.advance(learner, table, start)
             recent.append(jax.device_get(facts))
-            if update == first + 1:
-                began = time.monotonic()  # compiling does not count
-            rate = (update - first - 1) * per_update / max(time.monotonic() - began - aside, 1e-9)
+            rate = pace.count(per_update)
             words, solved = f"{update * per_update:,} env steps", averages(recent)["train/solve_rate"]
             if np.isfinite(solved):
                 words += f" · {solved:.1%} solved"
@@ -193,16 +192,15 @@ def update_until_done(
                 words += f" · {rate:,.0f} env steps/s · about {duration((last - update) * per_update / rate)} left"
             keep = update % interval == 0 or update == last
             if keep:
-                paused = time.monotonic()
-                numbers = {COURSE.step: update * per_update, "train/updates": update} | averages(recent)
-                numbers |= recipe.curriculum.facts(learner.curriculum)
-                numbers["train/env_steps_per_second"] = rate
-                numbers["train/core_seconds"] = before + time.process_time()
-                require_finite(numbers["loss/value"], "ppo.learning_rate")
-                recent = []
-                metrics.write(numbers)  # before the checkpoint: a run that continues drops lines after it
-                save(learner)
-                aside += time.monotonic() - paused
+                with pace.aside():
+                    numbers = {COURSE.step: update * per_update, "train/updates": update} | averages(recent)
+                    numbers |= recipe.curriculum.facts(learner.curriculum)
+                    numbers["train/env_steps_per_second"] = rate
+                    numbers["train/core_seconds"] = before + time.process_time()
+                    require_finite(numbers["loss/value"], "ppo.learning_rate")
+                    recent = []
+                    metrics.write(numbers)  # before the checkpoint: a run that continues drops lines after it
+                    save(learner)
             show(1, words, keep)
     return learner
 
