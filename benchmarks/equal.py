@@ -42,7 +42,7 @@ UPDATES = "train/updates"
 SETTLED = 5  # updates, after which lines no longer favour short episodes
 SHARES = "of all", "of solved", "best of 8"
 PLAYERS = "random", "sticky random", "its own expert, 256k"
-CLONE = "clone"
+CLONE, BUILTIN = "clone", "builtin:s"
 
 
 class Way(NamedTuple):
@@ -86,7 +86,7 @@ WAYS = {
     "levels, clone, teachers, reinforcement on these levels": Way(
         TUNING, CLONE, "#661100", own_levels=True, teachers=True
     ),
-    "from builtin:s": Way(TUNING, "builtin:s", "#009e73"),
+    "from builtin:s": Way(TUNING, BUILTIN, "#009e73"),
 }
 
 
@@ -132,8 +132,9 @@ def run(args: argparse.Namespace) -> Report:
             f"made from: the search of {args.levels} levels (`procedure=label`, ids from {FIRST:,} on, for the "
             f"second seed from {FIRST + BETWEEN_SEEDS:,}), the clone "
             f"({', '.join((f'{args.updates:,} updates', *(f'`{each}`' for each in args.cloning)))}), and "
-            "reinforcement learning for the rest, on random levels unless a way says otherwise; what builtin:s took "
-            "is not counted. Compare rows of one processor: another takes more or fewer env steps in as many "
+            "reinforcement learning for the rest, on random levels unless a way says otherwise"
+            f"{'; what builtin:s took is not counted' if any(WAYS[way].start == BUILTIN for way in shown) else ''}. "
+            "Compare rows of one processor: another takes more or fewer env steps in as many "
             "core-seconds. *Of all*: "
             f"{players[ALL]['random']['levels']:,} levels, of which some cannot be solved; *of solved*, and the best "
             f"of 8 attempts at them: the {players[SOLVED]['random']['levels']:,} that are labelled solved.",
@@ -204,18 +205,14 @@ def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
     if before >= ends[-1]:
         raise UserError(f"{way}: what comes before training takes {before:,.0f} core-seconds: raise --core-seconds.")
     for spent in (end for end in ends if end > before):
-        look, so_far = folder.with_name(f"{folder.name}-after-{spent:g}.json"), lines_of(folder)
+        look, so_far = folder.with_name(f"{folder.name}-after-{spent:g}-{args.measured}.json"), lines_of(folder)
         if spent < ends[-1] and (look.exists() or (so_far and so_far[-1][SECONDS] > spent - before)):
-            looks += (
-                [old] if look.exists() and (old := json.loads(look.read_text())).get("levels") == args.measured else []
-            )
+            looks += [json.loads(look.read_text())] if look.exists() else []
             continue  # of a run that was stopped, or had fewer core-seconds
         curve = trained(args, folder, way, start, seed, spent - before)
         rates = kept(args.folder / f"{folder.name}-{curve[-1][STEPS]}-{args.measured}.json", folder, *measuring(args))
         solved = rates[SOLVED][SAMPLED]["once"]
-        looks.append(
-            {"planned": spent, "levels": args.measured, SECONDS: before + curve[-1][SECONDS], "solved": solved}
-        )
+        looks.append({"planned": spent, SECONDS: before + curve[-1][SECONDS], "solved": solved})
         write(look, (json.dumps(looks[-1]) + "\n").encode())
     lines = [*curve[:: -(-len(curve) // POINTS)], curve[-1]]
     some = [{name: line.get(name) for name in (UPDATES, STEPS, SECONDS, RATE)} for line in lines]

@@ -72,9 +72,14 @@ def run(args: argparse.Namespace) -> Report:
 
 def require_same_data(args: argparse.Namespace) -> None:
     """Raise UserError if the folder holds what other levels or updates gave: it would be taken for these."""
-    told, file = json.dumps([str(args.split), args.where, args.updates]), args.folder / "settings.json"
+    told, file = (
+        json.dumps({"split": str(args.split), "where": args.where, "updates": args.updates}),
+        args.folder / "settings.json",
+    )
     if not file.exists():
-        file.parent.mkdir(parents=True, exist_ok=True)
+        args.folder.mkdir(parents=True, exist_ok=True)
+        if any(args.folder.iterdir()):
+            raise UserError(f"{args.folder} does not say what it was made with: choose another --folder.")
         write(file, told.encode())
     if (made := file.read_text()) != told:
         raise UserError(f"{args.folder} was made with {made}, not with {told}: choose another --folder.")

@@ -56,7 +56,8 @@ def run(args: argparse.Namespace) -> Report:
     policy = policy_at(args.policy)
     results = [measured(policy, split, args.attempts, args.levels) for split in args.splits]
     if unsolved := [split for one, split in zip(results, args.splits, strict=True) if not one["solved"]]:
-        raise UserError(f"No level of {unsolved[0]} is solved, so none has a cost: take more with --levels.")
+        advice = "raise --levels or leave it out" if args.levels else "name another split"
+        raise UserError(f"No level of {unsolved[0]} is solved, so none has a cost: {advice}.")
     found, saved = [], []
     for one in results:
         found.append(

@@ -46,9 +46,14 @@ def require_same_run(out: Path, note: dict[str, Any], free: Sequence[str] = ()) 
         if (out / CONFIG).exists():
             raise UserError(f"{out} has a policy already: choose another folder with -o.")
     elif changes := differences(_without(_without(before, (MADE_BY,)), free), _without(note, free)):
-        named = changes_text({name.removeprefix("settings."): change for name, change in changes.items()})
+        shown = {
+            name.removeprefix("settings."): change
+            for name, change in changes.items()
+            if name.startswith("settings.") or name == "cores"
+        }
+        told = changes_text(shown) or "the levels or the start differ"
         raise UserError(
-            f"{out} has a run with other settings or levels ({named}): repeat its command, or choose another -o."
+            f"{out} has a run with other settings or levels ({told}): repeat its command, or choose another -o."
         )
 
 

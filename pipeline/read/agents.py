@@ -72,14 +72,15 @@ def agent_in(file: Path) -> Agent:
     folder = file.parent.absolute()
     sys.path.insert(0, str(folder))  # as `python FILE` does
     before = set(sys.modules)
+    known = {name.partition(".")[0] for name in before}
     try:
         act = runpy.run_path(str(file)).get(ACT)
     except (Exception, SystemExit) as error:
         raise UserError(f"{file} failed: {type(error).__name__}: {error}.") from None
     finally:  # another agent's neighbours may have the same names
         for name in sys.modules.keys() - before:
-            top = folder / name.partition(".")[0]
-            if top.with_suffix(".py").is_file() or (top / "__init__.py").is_file():
+            beside = folder / (top := name.partition(".")[0])
+            if top not in known and (beside.with_suffix(".py").is_file() or (beside / "__init__.py").is_file()):
                 del sys.modules[name]
     if not callable(act):
         raise UserError(f"{file} defines no function {ACT}: docs/evaluate.md says what it is called with.")

@@ -24,7 +24,7 @@ def test_builtin_policies_are_small_and_say_how_they_were_made() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_builtin_policy_solves_levels_that_it_has_not_seen(name: str) -> None:
-    """Far more than doing nothing does, on levels whose ids no random level of a training has."""
+    """Far more than doing nothing does, on levels with ids that training never draws."""
     policy, ids = load_policy(f"{BUILTIN}{name}"), np.arange(FRESH_IDS, FRESH_IDS + 128, dtype=np.int32)
     levels = jax.device_get(sample_levels(ids, name))
     tries = play_sampled(policy.network)

@@ -74,16 +74,18 @@ def test_a_file_gets_kept_lines_and_one_every_half_minute(monkeypatch: pytest.Mo
 
 def test_run_that_another_stack_began_continues_and_says_so(tmp_path: Path) -> None:
     told = list[str]()
-    write_note(tmp_path, here := with_stack(tmp_path, {"seed": 0}, told.append))
-    assert with_stack(tmp_path, {"seed": 0}, told.append) == here
+    write_note(tmp_path, here := with_stack(tmp_path, {"settings": {"seed": 0}}, told.append))
+    assert with_stack(tmp_path, {"settings": {"seed": 0}}, told.append) == here
     assert not told
     (stack,) = here[MADE_BY]
-    write_note(tmp_path, {"seed": 0, MADE_BY: [stack | {"jax": "0.9"}]})
-    require_same_run(tmp_path, {"seed": 0})
-    assert with_stack(tmp_path, {"seed": 0}, told.append)[MADE_BY] == [stack | {"jax": "0.9"}, stack]
+    write_note(tmp_path, {"settings": {"seed": 0}, MADE_BY: [stack | {"jax": "0.9"}]})
+    require_same_run(tmp_path, {"settings": {"seed": 0}})
+    assert with_stack(tmp_path, {"settings": {"seed": 0}}, told.append)[MADE_BY] == [stack | {"jax": "0.9"}, stack]
     assert told == ["This run was begun with jax 0.9, so its policy will differ from that of an uninterrupted run."]
     with pytest.raises(UserError, match=r"has a run with other settings or levels \(seed was 0, now 1\): repeat"):
-        require_same_run(tmp_path, {"seed": 1})
+        require_same_run(tmp_path, {"settings": {"seed": 1}})
+    with pytest.raises(UserError, match=r"levels \(the levels or the start differ\): repeat"):
+        require_same_run(tmp_path, {"settings": {"seed": 0}, "start": "5e"})
     for damage in ("5", "[]", '{"cores": "two"}', "{"):
         (tmp_path / RUN).write_text(damage)
         with pytest.raises(Failure, match=r"Cannot read .*run\.json"):
