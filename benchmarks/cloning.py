@@ -167,9 +167,13 @@ def timed_command(*words: Any) -> tuple[str, float]:
         for file in (output, errors):
             file.seek(0)
         if process.returncode:
-            said = errors.read().strip().splitlines() or [f"exit code {process.returncode}"]
-            raise Failure(f"levelproof {words[0]} failed: {said[-1]}")
+            raise Failure(f"levelproof {words[0]} failed: {last_line(errors.read(), process.returncode)}")
         return output.read(), used.ru_utime + used.ru_stime
+
+
+def last_line(errors: str, code: int) -> str:
+    """Return the last line that a failed process wrote to stderr, or its exit code if it wrote none."""
+    return (errors.strip().splitlines() or [f"exit code {code}"])[-1]
 
 
 def timed_split(out: Path, *words: Any) -> float:

@@ -18,7 +18,7 @@ from threading import Lock
 from typing import Any, NamedTuple
 
 from benchmarks.cloning import SAMPLED, command, interval_text, kept, lines_of, timed_split
-from benchmarks.learners import ATTEMPTS, RATE, SECONDS, STEPS, add_ways, rates_text, slug
+from benchmarks.learners import ATTEMPTS, RATE, SECONDS, START, STEPS, add_ways, rates_text, slug
 from benchmarks.plotting import pyplot, save
 from benchmarks.report import Report, Table
 from benchmarks.teaching import DISTILLING
@@ -42,7 +42,7 @@ UPDATES = "train/updates"
 SETTLED = 5  # updates, after which lines no longer favour short episodes
 SHARES = "of all", "of solved", "best of 8"
 PLAYERS = "random", "sticky random", "its own expert, 256k"
-CLONE, BUILTIN = "clone", "builtin:s"
+CLONE = "clone"
 
 
 class Way(NamedTuple):
@@ -86,7 +86,7 @@ WAYS = {
     "levels, clone, teachers, reinforcement on these levels": Way(
         TUNING, CLONE, "#661100", own_levels=True, teachers=True
     ),
-    "from builtin:s": Way(TUNING, BUILTIN, "#009e73"),
+    "from builtin:s": Way(TUNING, START, "#009e73"),
 }
 
 
@@ -133,7 +133,7 @@ def run(args: argparse.Namespace) -> Report:
             f"second seed from {FIRST + BETWEEN_SEEDS:,}), the clone "
             f"({', '.join((f'{args.updates:,} updates', *(f'`{each}`' for each in args.cloning)))}), and "
             "reinforcement learning for the rest, on random levels unless a way says otherwise"
-            f"{'; what builtin:s took is not counted' if any(WAYS[way].start == BUILTIN for way in shown) else ''}. "
+            f"{f'; what {START} took is not counted' if any(WAYS[way].start == START for way in shown) else ''}. "
             "Compare rows of one processor: another takes more or fewer env steps in as many "
             "core-seconds. *Of all*: "
             f"{players[ALL]['random']['levels']:,} levels, of which some cannot be solved; *of solved*, and the best "

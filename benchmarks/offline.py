@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.cloning import SAMPLED, children_seconds, command, interval_text, kept
+from benchmarks.cloning import SAMPLED, children_seconds, command, interval_text, kept, last_line
 from benchmarks.learners import lines_of, slug
 from benchmarks.report import Report, Table
 from levelproof.pipeline.errors import Failure, UserError
@@ -72,10 +72,8 @@ def run(args: argparse.Namespace) -> Report:
 
 def require_same_data(args: argparse.Namespace) -> None:
     """Raise UserError if the folder holds what other levels or updates gave: it would be taken for these."""
-    told, file = (
-        json.dumps({"split": str(args.split), "where": args.where, "updates": args.updates}),
-        args.folder / "settings.json",
-    )
+    told = json.dumps({"split": str(args.split), "where": args.where, "updates": args.updates})
+    file = args.folder / "settings.json"
     if not file.exists():
         args.folder.mkdir(parents=True, exist_ok=True)
         if any(args.folder.iterdir()):
@@ -126,8 +124,7 @@ def trained(script: Path, datasets: Path, *words: Any) -> float:
         check=False,
     )
     if done.returncode:
-        said = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
-        raise Failure(f"{script} failed: {said[-1]}")
+        raise Failure(f"{script} failed: {last_line(done.stderr, done.returncode)}")
     return children_seconds() - before
 
 

@@ -46,14 +46,14 @@ def require_same_run(out: Path, note: dict[str, Any], free: Sequence[str] = ()) 
         if (out / CONFIG).exists():
             raise UserError(f"{out} has a policy already: choose another folder with -o.")
     elif changes := differences(_without(_without(before, (MADE_BY,)), free), _without(note, free)):
-        shown = {
+        named = {
             name.removeprefix("settings."): change
             for name, change in changes.items()
             if name.startswith("settings.") or name == "cores"
         }
-        told = changes_text(shown) or "the levels or the start differ"
+        what = changes_text(named) or "the levels or the start differ"  # which digests would not explain
         raise UserError(
-            f"{out} has a run with other settings or levels ({told}): repeat its command, or choose another -o."
+            f"{out} has a run with other settings or levels ({what}): repeat its command, or choose another -o."
         )
 
 

@@ -112,7 +112,7 @@ def prepared_cores(config: TrainConfig, note: dict[str, Any] | None) -> int:
     Raises:
         UserError: JAX has fewer devices than that.
     """
-    noted = int(note["cores"]) if note and "cores" in note else 0
+    noted = (note or {}).get("cores", 0)
     wanted = noted if noted and config.ppo.shares_out(noted) else config.cores  # else it is another run's folder
     even = next((cores for cores in range(len(own_cores()), 1, -1) if config.ppo.shares_out(cores)), 1)
     prepare_jax(devices=wanted or even)
