@@ -15,6 +15,56 @@ from levelproof.levelgen.task.environment import Environment, EnvParams, EnvStat
 from levelproof.levelgen.task.spaces import Dict, Discrete, MultiDiscrete, Space
 
 
+class _Methods:
+    """What gymnax's class requires of an environment; the class itself is known only once gymnax is imported."""
+
+    def __init__(self, inner: Environment, splits_done: bool) -> None:
+        self._inner, self._splits_done = inner, splits_done
+
+    @property
+    def default_params(self) -> EnvParams:
+        return self._inner.default_params
+
+    @property
+    def name(self) -> str:
+        return self._inner.name
+
+    @property
+    def num_actions(self) -> int:
+        return self._inner.num_actions
+
+    def reset(self, key: Key[Array, ""], params: EnvParams | None = None, override_reset_state=None) -> tuple:
+        return self._inner.reset(key, params, override_reset_state)
+
+    def step(
+        self, key: Key[Array, ""], state: EnvState, action: Any, params: EnvParams | None = None,
+        override_reset_state: EnvState | None = None,
+    ) -> tuple:  # fmt: skip
+        *before, done, info = self._inner.step(key, state, _array(action), params, override_reset_state)
+        ends = (info["terminated"], info["truncated"]) if self._splits_done else (done,)
+        return *before, *ends, info
+
+    def reset_env(self, key: Key[Array, ""], params: EnvParams | None = None) -> tuple:
+        return self._inner.reset_env(key, params)
+
+    def step_env(self, key: Key[Array, ""], state: EnvState, action: Any, params: EnvParams | None = None) -> tuple:
+        """Take one env step without reset; as in gymnax, the fourth result is `terminated` (before 1.0: `done`)."""
+        *before, done, info = self._inner.step_env(key, state, _array(action), params)
+        return *before, info["terminated"] if self._splits_done else done, info
+
+    def get_obs(self, state: EnvState, params: EnvParams | None = None, key: Key[Array, ""] | None = None) -> Any:
+        return self._inner.get_obs(state)
+
+    def is_truncated(self, state: EnvState, params: EnvParams | None = None) -> Bool[Array, ""]:
+        return state.timestep >= self._inner.rules.max_timesteps
+
+    def action_space(self, params: EnvParams | None = None) -> Any:
+        return _converted(self._inner.action_space(params))
+
+    def observation_space(self, params: EnvParams | None = None) -> Any:
+        return _converted(self._inner.observation_space(params))
+
+
 def to_gymnax(env: Environment) -> Any:
     """Wrap an environment in gymnax's own classes, for code that checks for them.
 
@@ -26,64 +76,10 @@ def to_gymnax(env: Environment) -> Any:
     Raises:
         ImportError: gymnax is not installed.
     """
-    GymnaxBase: Any = import_module("gymnax.environments.environment").Environment  # noqa: N806
-
-    splits_done = hasattr(GymnaxBase, "is_truncated")  # since 1.0
+    base = import_module("gymnax.environments.environment").Environment
+    splits_done = hasattr(base, "is_truncated")  # since 1.0
     inner = replace(env, final_observation=True) if splits_done else env  # 1.0 always has it in info
-
-    def as_gymnax(result: tuple) -> tuple:
-        observation, state, reward, done, info = result
-        return (
-            observation,
-            state,
-            reward,
-            *((info["terminated"], info["truncated"]) if splits_done else (done,)),
-            info,
-        )
-
-    class GymnaxEnvironment(GymnaxBase):
-        @property
-        def default_params(self) -> EnvParams:
-            return inner.default_params
-
-        @property
-        def name(self) -> str:
-            return inner.name
-
-        @property
-        def num_actions(self) -> int:
-            return inner.num_actions
-
-        def reset(self, key: Key[Array, ""], params: EnvParams | None = None, override_reset_state=None) -> tuple:
-            return inner.reset(key, params, override_reset_state)
-
-        def step(
-            self, key: Key[Array, ""], state: EnvState, action: Any, params: EnvParams | None = None,
-            override_reset_state: EnvState | None = None,
-        ) -> tuple:  # fmt: skip
-            return as_gymnax(inner.step(key, state, _array(action), params, override_reset_state))
-
-        def reset_env(self, key: Key[Array, ""], params: EnvParams | None = None) -> tuple:
-            return inner.reset_env(key, params)
-
-        def step_env(self, key: Key[Array, ""], state: EnvState, action: Any, params: EnvParams | None = None) -> tuple:
-            """Take one env step without reset; as in gymnax, the fourth result is `terminated` (before 1.0: `done`)."""
-            observation, state, reward, done, info = inner.step_env(key, state, _array(action), params)
-            return observation, state, reward, info["terminated"] if splits_done else done, info
-
-        def get_obs(self, state: EnvState, params: EnvParams | None = None, key: Key[Array, ""] | None = None) -> Any:
-            return inner.get_obs(state)
-
-        def is_truncated(self, state: EnvState, params: EnvParams | None = None) -> Bool[Array, ""]:
-            return state.timestep >= inner.rules.max_timesteps
-
-        def action_space(self, params: EnvParams | None = None) -> Any:
-            return _converted(inner.action_space(params))
-
-        def observation_space(self, params: EnvParams | None = None) -> Any:
-            return _converted(inner.observation_space(params))
-
-    return GymnaxEnvironment()
+    return type("GymnaxEnvironment", (_Methods, base), {})(inner, splits_done)
 
 
 def _array(action: Any) -> Array:
