@@ -1,8 +1,10 @@
 """Hydra's edge: override strings in, typed settings out."""
 
+import os
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 from itertools import product
@@ -235,13 +237,14 @@ def compose_train(overrides: Sequence[str]) -> "TrainConfig":
 
     parsed = [_parse(text) for text in overrides]
     config = _changed(TrainConfig, parsed)
+    config = replace(config, start=os.path.expanduser(config.start), levels=os.path.expanduser(config.levels))
     names = [override.key_or_group for override in parsed]
     random = config.levels in CURRICULA
     useless = ("where", "choice", "starts") if random else ("size", "distribution")
     for name in names:
         if name.partition(".")[0] in useless:
             kind = "random levels" if random else "the levels of a split or of files"
-            raise ConfigError(f"{name} has no effect on {kind}, as levels={config.levels} names: leave it out.")
+            raise ConfigError(f"{name} has no effect on {kind} (levels={config.levels}): leave it out.")
         if config.chosen_by not in READ_BY.get(name.partition(".")[0], [config.chosen_by]):
             chosen = f"levels={config.levels}" if random else f"choice={config.choice}"
             raise ConfigError(f"{name} has no effect with {chosen}: leave it out.")
@@ -253,7 +256,8 @@ def compose_train(overrides: Sequence[str]) -> "TrainConfig":
     _require_heads(config.network.kind, parsed)
     if random and config.distribution not in distributions():
         hint = suggestion(config.distribution, distributions())
-        raise ConfigError(f"there is no distribution {config.distribution}{hint}.")
+        names = ", ".join(distributions())
+        raise ConfigError(f"there is no distribution {config.distribution}{hint}: choose one of {names}.")
     return config
 
 
@@ -267,6 +271,7 @@ def compose_distill(overrides: Sequence[str]) -> "DistillConfig":
 
     parsed = [_parse(text) for text in overrides]
     config = _changed(DistillConfig, parsed)
+    config = replace(config, start=os.path.expanduser(config.start))
     noise = ("teachers.sticky", "teachers.perturbed")
     asking = ("failed", *(f"teachers.{name}" for name in ("expert", "witness", "random", "learner")))
     for setting in parsed:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
+from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.generalist.config import EvolveConfig, LearnabilityConfig, PPOConfig, ReplayConfig
 from levelproof.experts.networks.over_levels import NetworkConfig
 from levelproof.physics.bounds import require
@@ -39,7 +40,8 @@ class TrainConfig:
         return self.levels if self.levels in CURRICULA else self.choice
 
     def __post_init__(self) -> None:
-        require(self, ("interval", "starts"), 1)
+        require(self, ("interval",), 1)
+        require(self, ("starts",), 1, RECORD_STEPS)
         require(self, ("cores",), 0, 1024)
         require(self, ("seed",), 0, 2**31 - 1)
         if not self.levels:

@@ -61,7 +61,7 @@ class PPOConfig:
     def training_rules(self, rules: TaskParams) -> TaskParams:
         """Return the rules of training: those of the task, with this shaping reward, an action per `repeat` env steps.
 
-        Goal and red are still looked for after every physics step, so what ends an episode stays the same; only the
+        Goal and red are still checked after every physics step, so what ends an episode stays the same; only the
         time limit is rounded up to a whole number of actions.
         """
         return replace(
@@ -71,14 +71,14 @@ class PPOConfig:
             max_timesteps=-(-rules.max_timesteps // self.repeat),
         )
 
-    def shares_out(self, cores: int) -> bool:
+    def divides_evenly(self, cores: int) -> bool:
         """Whether this number of cores divides the lanes evenly, and minibatches the chunks of a core."""
         with suppress(ValueError):
             return bool(self.samples(cores))
         return False
 
     def samples(self, cores: int) -> int:
-        """Return how many samples a core learns from at every time, a whole number of chunks.
+        """Return the number of samples per time step that a core learns from: a whole number of chunks, rounded down.
 
         Raises:
             ValueError: the cores do not divide the lanes evenly, or the minibatches the chunks of a core.
@@ -87,15 +87,15 @@ class PPOConfig:
         width = min(lanes, CHUNK)
         if over or lanes % width:
             raise ValueError(
-                f"environments is {self.environments}: with {cores} cores it must be a multiple of "
+                f"environments is {self.environments}: with {cores} core{'s' * (cores != 1)} it must be a multiple of "
                 f"{cores if self.environments < cores * CHUNK else cores * CHUNK}"
             )
         some = max(int(lanes * self.subsample), 1)
         some -= some % min(some, CHUNK)
         if (chunks := some // min(some, CHUNK) * self.horizon) % self.minibatches:
             raise ValueError(
-                f"minibatches is {self.minibatches}: it must divide {chunks}, the chunks of samples of a core "
-                f"(horizon = {self.horizon}, subsample = {self.subsample:g})"
+                f"minibatches is {self.minibatches}: it must divide {chunks}, the number of chunks of samples that "
+                f"each core learns from (horizon = {self.horizon}, subsample = {self.subsample:g})"
             )
         return some
 

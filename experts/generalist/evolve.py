@@ -15,10 +15,9 @@ import numpy as np
 from jaxtyping import Array, Int, Key
 
 from levelproof.experts.generalist.config import EvolveConfig, ReplayConfig
-from levelproof.experts.generalist.curricula import Curriculum, fresh
+from levelproof.experts.generalist.curricula import Curriculum, chance, fresh
 from levelproof.experts.generalist.replay import (
     ReplayBuffer,
-    chance,
     drawn_from,
     empty,
     facts_of,

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-EVEN = 0.5  # what every sample's chance has besides its gain, in multiples of the mean gain; bounds the weights
-LEAST = 1e-6  # of every chance, so that samples are chosen evenly where no gain differs from 0
+EVEN = 0.5  # added to every sample's absolute gain, in multiples of their mean; bounds the weights
+LEAST = 1e-6  # added to every chance: if all gains are 0, samples are chosen evenly
 
 
 def choose(
@@ -20,7 +20,7 @@ def choose(
 ) -> tuple[Int[Array, "time sample"], Float[Array, "time sample"]]:
     """Choose as many lanes at every time, with chances that grow with the size of their gain.
 
-    The choice is systematic: a lane whose chance is k in `samples` is chosen k times, rounded up or down.
+    The choice is systematic: a lane that is expected k times is chosen k times, rounded up or down.
 
     Args:
         gain: advantages, normalised.

@@ -1,4 +1,6 @@
-"""Teachers of one policy for all levels: they play on from any state, and only an attempt that replays is a label.
+"""Teachers of one policy for all levels, which play on from any state.
+
+Only an attempt whose replay reaches the goal becomes a label.
 
 A level's expert is asked first. If it does not reach the goal from a state in the env steps that its episode has left,
 a short search follows: variations of the level's witness, sticky random actions, and further attempts of the learner.
@@ -33,10 +35,10 @@ AT_ONCE = 64  # states that teachers are asked about side by side
 class TeachersConfig:
     """How often each teacher tries to reach the goal from a state (0: it is not asked), and noise of demonstrations."""
 
-    expert: int = 4  # attempts of the level's expert from a state, if the split kept experts; 0: it is not asked
-    witness: int = 16  # attempts of a search from a state that vary the level's witness
-    random: int = 32  # attempts of a search from a state by sticky random actions
-    learner: int = 4  # attempts of a search from a state by the learner itself
+    expert: int = 4  # attempts per state by the level's expert, if the split kept experts; 0: it is not asked
+    witness: int = 16  # attempts per state that vary the level's witness, if the expert fails
+    random: int = 32  # attempts per state by sticky random actions, if the expert fails
+    learner: int = 4  # attempts per state by the learner itself, if the expert fails
     sticky: float = 0.5  # share of demonstrations in which the action executed last sometimes replaces the expert's
     perturbed: float = 0.5  # share of demonstrations that start with perturbed velocities, drawn independently
 

@@ -33,7 +33,7 @@ from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.types import Size
 
 CORES = "core"  # axis of the mesh
-BEGINNING, PLAYING, MEASURING, BREEDING = range(1, 5)  # folded into the seed's key; clones take its own
+BEGINNING, PLAYING, MEASURING, BREEDING = range(1, 5)  # folded into the seed's key; cloning uses that key itself
 TERMS = 4  # means over samples in UpdateFacts
 
 

@@ -26,7 +26,8 @@ def run(arguments: argparse.Namespace) -> None:
     from levelproof.pipeline.learn.clone import clone
     from levelproof.pipeline.urls import require_known
 
-    splits, settings = parted(dict.fromkeys(arguments.words))
+    splits, settings = parted(arguments.words)
+    splits = list(dict.fromkeys(splits))
     if not splits:
         raise UserError("There is no split to clone: name one, as in `levelproof clone data/128k/s`.")
     for split in splits:

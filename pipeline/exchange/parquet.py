@@ -16,7 +16,7 @@ from levelproof.levelgen.identity.content import content_hashes
 from levelproof.levelgen.sampling.sampler import CHUNK
 from levelproof.pipeline.exchange.tables import columns_for
 from levelproof.pipeline.read.levels import levels_of
-from levelproof.pipeline.read.pace import ProgressBar
+from levelproof.pipeline.read.progress_bar import ProgressBar
 from levelproof.pipeline.read.select import columns_in, select_some
 from levelproof.pipeline.store.columns import COLUMNS
 from levelproof.pipeline.store.created import new_folder

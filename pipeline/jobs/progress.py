@@ -12,9 +12,9 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 from levelproof.experts.steps import NO_SECONDS, EnvSteps, Seconds
 from levelproof.pipeline.jobs.schedule import Round, Summary, WorkUnit
+from levelproof.pipeline.read.progress_bar import LINE_EVERY
 from levelproof.pipeline.words import duration
 
-LINE_EVERY = 30.0  # s between plain lines
 LINE_AFTER = 2.0  # s between plain lines that report commits; the last commit is always reported
 STOPPING = "Stopping once decided levels are committed; press Ctrl-C to quit now."
 PACE_OVER = 60.0  # s over which env steps/s and the remaining time are averaged

@@ -11,7 +11,6 @@ from flax.typing import VariableDict
 from rich.console import Console
 
 from levelproof.configs.clone import CloneConfig
-from levelproof.configs.convert import plain
 from levelproof.experts.evaluation import FirstEpisodes, play, play_sampled
 from levelproof.experts.imitation import Imitation, Likeness, Transitions, begin_imitation, compare, imitate
 from levelproof.experts.networks.over_levels import PolicyKind
@@ -26,20 +25,21 @@ from levelproof.pipeline.learn.curves import BLUE, GREEN, Curves, Panel
 from levelproof.pipeline.learn.folder import (
     continued,
     keep_run,
-    made,
     require_finite,
     require_same_run,
+    settings_without,
     shown,
+    tell_done,
     with_stack,
     write_note,
+    writing_run,
 )
 from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.pace import Pace
 from levelproof.pipeline.learn.pool import Feed, PartedSplit, validation_batches
 from levelproof.pipeline.learn.sealed import require_not_sealed, without_sealed
+from levelproof.pipeline.read.progress_bar import ProgressBar
 from levelproof.pipeline.runtime import prepare_jax
-from levelproof.pipeline.store.disk import explaining_writes
-from levelproof.pipeline.store.locks import only_clone
 from levelproof.pipeline.words import duration
 
 SOLVED = "eval/sampled_episode_solve_rate"
@@ -72,25 +72,21 @@ def clone(splits: Sequence[Path], config: CloneConfig, out: Path, console: Conso
     tell = lambda text: say(console, text)
     sources = [source_of(split, config, tell) for split in splits]
     size, note = size_for(sources, config), note_of(sources, config)
-    with explaining_writes(out), only_clone(made(out)) as require_ours:
+    with writing_run(out) as require_ours:
         require_same_run(out, note)
         state = continued(out, begin_imitation(np.int32(config.seed), config.network, size, config.train))
         write_note(out, note := with_stack(out, note, tell))
         curves = COURSE if config.played else COURSE._replace(panels=COURSE.panels[:-1])
-        metrics, done = Metrics(out, curves, config.log, note, int(state.updates), tell, require_ours), False
 
         def save(state: Imitation) -> None:
             require_ours()
             keep(out, state, config, size, note)
 
-        try:
+        with Metrics(out, curves, config.log, note, int(state.updates), tell, require_ours) as metrics:
             if int(state.updates) < config.train.updates:
                 state = train(sources, config, save, state, metrics, console)
-            done = True
-        finally:
-            metrics.close(done)
         save(state)
-    tell(f"The policy is in {out}. Next: levelproof evaluate {out}")
+    tell_done(out, tell)
 
 
 def source_of(split: Path, config: CloneConfig, tell: Callable[[str], None]) -> PartedSplit:
@@ -126,7 +122,7 @@ def size_for(sources: Sequence[PartedSplit], config: CloneConfig) -> Size:
 
 def note_of(sources: Sequence[PartedSplit], config: CloneConfig) -> dict[str, Any]:
     """Return what decides a run's result, as JSON."""
-    settings = {name: value for name, value in plain(config).items() if name not in WITHOUT_EFFECT}
+    settings = settings_without(config, WITHOUT_EFFECT)
     splits = [
         {"split": str(s.data.split), "levels": len(s.data), "ids": s.data.fingerprint, "copies_of_sealed": s.copies}
         for s in sources
@@ -155,10 +151,12 @@ def train(
     """
     last, first, recent = config.train.updates, int(state.updates), []
     before, pace = metrics.last.get("bc/core_seconds", 0.0), Pace()
-    with shown(console, "reading levels", last, first) as show:
-        feed = Feed(sources, config, lambda count: show(0, f"reading {count} levels"))
+    feed = Feed(sources, config)
+    with ProgressBar("levels read", feed.levels, console) as bar:
+        batches = feed.batches(first, feed.read(first, bar.advance))
+    with shown(console, "compiling", last, first) as show:
         held = {str(source.data.split): held_of(source, config) for source in sources}
-        for update, batch in enumerate(feed.batches(first), first + 1):
+        for update, batch in enumerate(batches, first + 1):
             state, likeness = imitate(state, batch, config.network, config.train)
             recent.append(likeness)
             jax.block_until_ready(likeness)
@@ -168,7 +166,7 @@ def train(
             words, keep = f"{update:,}/{last:,} updates{speed}", update % config.interval == 0 or update == last
             if keep:
                 with pace.aside():
-                    numbers = {COURSE.step: update, "bc/samples_per_second": rate * config.train.batch}
+                    numbers = {COURSE.step: update, "bc/samples_per_second": rate * config.train.batch or np.nan}
                     numbers |= averages("", recent) | validated(state, held, config)
                     numbers["bc/core_seconds"] = before + time.process_time()
                     require_finite(numbers["bc/loss"], "train.learning_rate")

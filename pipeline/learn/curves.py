@@ -31,7 +31,7 @@ class Curves(NamedTuple):
     names: Mapping[Colour, str]  # of the colours
 
 
-WIDE, HIGH, GAP, EDGE = 4.0, 2.2, 0.9, 0.75  # of a panel; between panels; around them
+WIDE, HIGH, GAP, EDGE = 4.0, 2.2, 0.9, 0.75  # width and height of a panel, gap between panels, margin
 TICKS = 5
 
 

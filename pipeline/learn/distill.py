@@ -13,7 +13,6 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from levelproof.configs.convert import plain
 from levelproof.configs.distill import DistillConfig
 from levelproof.experts.generalist.teachers import no_experts
 from levelproof.experts.imitation import Imitation, Likeness, Transitions, begin_imitation, imitate
@@ -28,13 +27,15 @@ from levelproof.pipeline.learn.curves import BLUE, GREEN, YELLOW, Curves, Panel
 from levelproof.pipeline.learn.folder import (
     continued,
     keep_run,
-    made,
     require_finite,
     require_same_run,
+    settings_without,
     shown,
+    tell_done,
     weights_digest,
     with_stack,
     write_note,
+    writing_run,
 )
 from levelproof.pipeline.learn.kept_experts import experts_of
 from levelproof.pipeline.learn.labelled import LabelBuffer, empty_labels
@@ -44,9 +45,8 @@ from levelproof.pipeline.learn.pool import read_pool
 from levelproof.pipeline.learn.rounds import TaughtLevels, teach
 from levelproof.pipeline.learn.sealed import require_not_sealed, require_some_usable, without_sealed
 from levelproof.pipeline.read.policies import policy_at, require_size
+from levelproof.pipeline.read.progress_bar import ProgressBar
 from levelproof.pipeline.runtime import prepare_jax
-from levelproof.pipeline.store.disk import explaining_writes
-from levelproof.pipeline.store.locks import only_clone
 from levelproof.pipeline.words import duration
 
 COURSE = Curves(
@@ -80,12 +80,12 @@ def distill(split: Path, config: DistillConfig, out: Path, console: Console) -> 
     tell = lambda text: say(console, text)
     start = policy_at(Path(config.start)) if config.start else None
     network = start.network if start else config.network
-    taught = levels_for(split, config, network, tell)
+    taught = levels_for(split, config, network, console)
     size = taught.levels.size
     if start:
         require_size(start, size, str(split), "start from one that plays any size")
     note = note_of(taught, config)
-    with explaining_writes(out), only_clone(made(out)) as require_ours:
+    with writing_run(out) as require_ours:
         require_same_run(out, note)
         params = start.params if start else None
         columns = taught.witnesses.motion.shape[1]
@@ -96,7 +96,6 @@ def distill(split: Path, config: DistillConfig, out: Path, console: Console) -> 
         now = continued(out, fresh)
         now = now._replace(labels=jax.device_get(now.labels))
         write_note(out, note := with_stack(out, note, tell))
-        metrics, done = Metrics(out, COURSE, config.log, note, int(now.imitation.updates), tell, require_ours), False
 
         def save(now: Distillation) -> None:
             require_ours()
@@ -104,22 +103,20 @@ def distill(split: Path, config: DistillConfig, out: Path, console: Console) -> 
             origin |= {"start_origin": dict(start.origin)} if start else {}
             keep_run(out, Policy(network, now.imitation.average, network.only_size(size), origin), now)
 
-        try:
+        with Metrics(out, COURSE, config.log, note, int(now.imitation.updates), tell, require_ours) as metrics:
             now = update_until_done(taught, config, network, now, save, metrics, console)
-            done = True
-        finally:
-            metrics.close(done)
         save(now)
-    tell(f"The policy is in {out}. Next: levelproof evaluate {out}")
+    tell_done(out, tell)
 
 
-def levels_for(split: Path, config: DistillConfig, network: NetworkConfig, tell: Callable[[str], None]) -> TaughtLevels:
+def levels_for(split: Path, config: DistillConfig, network: NetworkConfig, console: Console) -> TaughtLevels:
     """Read the levels of a split that have a witness and are not trivial; leave out copies of sealed levels.
 
     Raises:
         UserError: the split is unusable, has sealed ids, or no usable level.
         Failure: its data is damaged.
     """
+    tell = lambda text: say(console, text)
     data = Dataset(split, config.where or None, (), 0.0)
     ids = data.manifest["level_id"].to_numpy()
     require_not_sealed(split, ids)
@@ -131,7 +128,6 @@ def levels_for(split: Path, config: DistillConfig, network: NetworkConfig, tell:
     chosen = np.flatnonzero(usable & ~trivial)
     if len(chosen) > config.pool:
         chosen = np.sort(np.random.default_rng(config.seed).choice(chosen, config.pool, replace=False))
-    tell(f"Reading {len(chosen):,} levels")
     facts = {
         "split": str(split),
         "levels": len(chosen),
@@ -150,14 +146,14 @@ def levels_for(split: Path, config: DistillConfig, network: NetworkConfig, tell:
             f"{split} has no kept experts of these levels, and {only}: set {remedy}, or make a split in a folder of "
             "this machine with keep_experts=true."
         )
-    return TaughtLevels(
-        split, facts, ids[chosen], data.levels(chosen), read_pool(data, chosen, network), experts, data.rules
-    )
+    with ProgressBar("levels read", len(chosen), console) as bar:
+        witnesses = read_pool(data, chosen, network, follow=bar.advance)
+    return TaughtLevels(split, facts, ids[chosen], data.levels(chosen), witnesses, experts, data.rules)
 
 
 def note_of(taught: TaughtLevels, config: DistillConfig) -> dict[str, Any]:
     """Return what decides a run's result, as JSON."""
-    settings = {name: value for name, value in plain(config).items() if name not in WITHOUT_EFFECT}
+    settings = settings_without(config, WITHOUT_EFFECT)
     return {"splits": [taught.facts], "settings": settings, "start": weights_digest(config.start)}
 
 
@@ -180,7 +176,7 @@ def update_until_done(
     before, pace = metrics.last.get("distill/core_seconds", 0.0), Pace()
     with shown(console, "compiling", last, first) as show:
         for update in range(first, last, config.interval):
-            show(0, f"{update:,}/{last:,} updates · teachers at work")
+            show(0, f"{update:,}/{last:,} updates · asking teachers")
             number = update // config.interval
             labels, numbers = teach(taught, config, network, now.imitation.average, now.labels, number)
             now = now._replace(labels=labels)

@@ -22,6 +22,7 @@ from levelproof.experts.evaluation import (
 )
 from levelproof.experts.networks.saved import BUILTIN, Policy
 from levelproof.levelgen.level import SIZES, name_of
+from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.learn.looks import LOOKS, SEALED, log_look
@@ -32,8 +33,8 @@ from levelproof.pipeline.learn.solve_rates import Solved, difference, solve_rate
 from levelproof.pipeline.learn.specialists import Specialists, sealed_specialists, specialists_of
 from levelproof.pipeline.read.agents import SUFFIX as AGENT_SUFFIX
 from levelproof.pipeline.read.agents import Agent, agent_in
-from levelproof.pipeline.read.pace import ProgressBar
 from levelproof.pipeline.read.policies import policy_at, require_size
+from levelproof.pipeline.read.progress_bar import ProgressBar
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.words import many
 
@@ -64,10 +65,10 @@ def evaluate(
         where: SQL condition that selects levels of a split.
         sizes: sizes of the sealed or published levels; None: s of the sealed, all of the published.
         count: number of levels, the first ones; None: all.
-        attempts: attempts at each level; None: as many as published rates come from, else ATTEMPTS.
+        attempts: attempts at each level; None: the number behind the published rates, or else ATTEMPTS.
         seed: of the attempts.
         starts: where in the witnesses of a split attempts start, as shares of the steps to the goal, 0 to below 1.
-        experts: splits whose own experts of the levels stand in the table, too.
+        experts: splits whose experts of these levels are listed for comparison.
         as_json: whether to print JSON instead of tables.
         against: another policy or agent, with which `policy` is compared level by level; None: none.
 
@@ -87,9 +88,6 @@ def evaluate(
     for group in groups:
         own = _own_experts(group, on, experts, attempts)
         facts.append(_measured(group, entrants, own, [each.main for each in contestants], attempts, seed, console))
-        for each in contestants:
-            if each.agent and each.agent.error:
-                raise UserError(f"{each.agent.error}.")
         if np.isin(group.level_ids, SEALED_IDS).any():  # in a split of them, too
             looked_at.append(facts[-1])
     for each in contestants if looked_at else ():
@@ -139,8 +137,9 @@ def _groups(
             raise UserError(
                 f"--start plays from states of a split's witnesses, but {on} is not a split: name one with --on."
             )
+        data = Dataset(Path(on), where, (), 0.0)
         for start in starts:
-            yield midway_levels(Path(on), where, count, start)
+            yield midway_levels(data, count, start)
     elif on == SEALED:
         for size in dict.fromkeys(sizes or ["s"]):
             yield sealed_levels(size, count)
@@ -198,7 +197,7 @@ def _log(one: _Contestant, looked_at: Sequence[dict[str, Any]], attempts: int, s
 
 
 def _own_experts(group: MeasuredLevels, on: str, splits: Sequence[Path], attempts: int) -> list[Specialists]:
-    """Return the rated attempts of the levels' own experts; of two with one budget, the second names its split."""
+    """Return the rated attempts of the levels' own experts; the second with a budget names its split."""
     own = sealed_specialists(name_of(group.levels.size), len(group.level_ids), attempts) if on == SEALED else []
     for split in splits:
         one = specialists_of(split, group.level_ids, attempts)
@@ -219,13 +218,16 @@ def _measured(
     """Play one group of levels; return its facts as JSON types.
 
     With two players in `compared`, `difference` says by how much the first is better than the second.
+
+    Raises:
+        UserError: an agent fails.
     """
     solved, steps = dict[str, Solved](), dict[str, Any]()
     what = f"levels of {group.name}, player by player"
     with ProgressBar(what, len(group.level_ids) * len(entrants), console) as bar:
         for name, (player, params, chance) in entrants.items():
-            tries = attempts if chance else 1
-            played = play(player, params, group.levels, group.level_ids, tries, seed, group.rules, bar.advance)
+            tries, follow = attempts if chance else 1, partial(_advance, bar, player)
+            played = play(player, params, group.levels, group.level_ids, tries, seed, group.rules, follow)
             solved[name], steps[name] = played
     solved |= dict(experts)
     chosen = {ALL: np.ones(len(group.level_ids), bool), NOT_TRIVIAL: ~solved[NOTHING][:, 0]}
@@ -251,6 +253,13 @@ def _measured(
             for title, some in chosen.items()
         },
     }
+
+
+def _advance(bar: ProgressBar, player: Player, count: int) -> None:
+    """Advance the bar. Raise UserError if the player is an agent that has failed: from then on it does nothing."""
+    if isinstance(player, Agent) and player.error:
+        raise UserError(f"{player.error}.")
+    bar.advance(count)
 
 
 def _print(facts: dict[str, Any], attempts: int, console: Console) -> None:

@@ -1,8 +1,9 @@
-"""The folder of a run that makes a policy: what decides the run, its checkpoint and its policy; and the run's bar."""
+"""A training run's folder: its note (`run.json`), checkpoint and policy. Also the run's progress bar."""
 
 import hashlib
 import json
 import math
+import shlex
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -15,11 +16,14 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from safetensors.numpy import load, save
 
+from levelproof.configs.convert import plain
 from levelproof.experts.networks.saved import CONFIG, WEIGHTS, Policy, named, policy_folder, save_policy, unnamed
 from levelproof.pipeline.errors import Failure, UserError
-from levelproof.pipeline.jobs.progress import LINE_EVERY, say
-from levelproof.pipeline.store.disk import NotRegular, read_regular
+from levelproof.pipeline.jobs.progress import say
+from levelproof.pipeline.read.progress_bar import LINE_EVERY
+from levelproof.pipeline.store.disk import NotRegular, explaining_writes, read_regular
 from levelproof.pipeline.store.files import write
+from levelproof.pipeline.store.locks import only_trainer
 from levelproof.pipeline.store.manifest import changes_text, differences
 from levelproof.pipeline.store.provenance import device, versions
 
@@ -37,10 +41,25 @@ def made(out: Path) -> Path:
     return out
 
 
+@contextmanager
+def writing_run(out: Path) -> Iterator[Callable[[], None]]:
+    """Create and lock a run's folder; yield a function to call before each write, as `only_trainer` does.
+
+    Raises:
+        UserError: `out` cannot be the folder of a policy, or another command is writing to it.
+        Failure: a write fails.
+    """
+    with explaining_writes(out, "the last checkpoint stays"), only_trainer(made(out)) as require_ours:
+        for name in (CHECKPOINT, RUN):
+            for unfinished in out.glob(f".{name}.[0-9]*"):  # of a killed command
+                unfinished.unlink(missing_ok=True)
+        yield require_ours
+
+
 def require_same_run(out: Path, note: dict[str, Any], free: Sequence[str] = ()) -> None:
     """Raise UserError if `out` holds a run of other settings or data, or a policy of unknown origin.
 
-    `free` is the path, as keys, of the value in the note that may differ.
+    `free` is the key path of the one value in the note that may differ.
     """
     if (before := note_in(out)) is None:
         if (out / CONFIG).exists():
@@ -60,7 +79,7 @@ def require_same_run(out: Path, note: dict[str, Any], free: Sequence[str] = ()) 
 def with_stack(out: Path, note: dict[str, Any], tell: Callable[[str], None]) -> dict[str, Any]:
     """Return the note with the versions and devices that have trained the run in `out`, this machine's last.
 
-    Tells the user if they differ from those before: the same command then need not give the same bytes.
+    Tells the user if the last ones before were others: the same command then need not give the same bytes.
 
     Raises:
         Failure: the note is damaged.
@@ -70,7 +89,7 @@ def with_stack(out: Path, note: dict[str, Any], tell: Callable[[str], None]) -> 
         raise Failure(f"{out / RUN} is damaged ({MADE_BY}): choose another folder with -o.")
     if before and before[-1] != now:
         others = ", ".join(f"{name} {value}" for name, value in before[-1].items() if now.get(name) != value)
-        tell(f"This run was begun with {others}, so its policy will differ from that of an uninterrupted run.")
+        tell(f"This run was last trained with {others}, so its policy may differ from that of an uninterrupted run.")
     return note | {MADE_BY: before if before[-1:] == [now] else [*before, now]}
 
 
@@ -85,7 +104,13 @@ def _without(note: Any, path: Sequence[str]) -> Any:
 
 
 def note_in(out: Path) -> dict[str, Any] | None:
-    """Return what decides the result of the run in `out`; None: there is none. Raise Failure if it is damaged."""
+    """Return what decides the result of the run in `out`, or None if no run has saved anything there.
+
+    Raises:
+        Failure: the note is damaged.
+    """
+    if not (out / CHECKPOINT).exists() and not (out / CONFIG).exists():
+        return None  # stopped before its first checkpoint: other settings may begin anew
     try:
         note = json.loads(read_regular(out / RUN))
         if not isinstance(note, dict) or type(note.get("cores", 1)) is not int:
@@ -120,6 +145,16 @@ def continued(out: Path, fresh: T) -> T:
         raise Failure(f"The checkpoint in {out} is damaged ({error}): start again with another -o.") from None
 
 
+def settings_without(config: Any, names: Sequence[str]) -> dict[str, Any]:
+    """Return settings as JSON, without those that a resumed run may change."""
+    return {name: value for name, value in plain(config).items() if name not in names}
+
+
+def tell_done(out: Path, tell: Callable[[str], None]) -> None:
+    """Tell the user where the policy is, and the next command."""
+    tell(f"The policy is in {out}. Next: levelproof evaluate {shlex.quote(str(out))}")
+
+
 def weights_digest(policy: str) -> str | None:
     """Return the SHA-256 of the weights of the policy that a run starts from; None for an empty name."""
     return hashlib.sha256((policy_folder(policy) / WEIGHTS).read_bytes()).hexdigest() if policy else None
@@ -145,7 +180,7 @@ def keep_run(out: Path, policy: Policy, state: Any) -> None:
             "The weights have diverged: start again with a smaller learning rate and another -o (no checkpoint was "
             "overwritten)."
         )
-    write(out / CHECKPOINT, save(named(state)))
+    write(out / CHECKPOINT, save(named(state)), durable=True)
     save_policy(out, policy)
 
 

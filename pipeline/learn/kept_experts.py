@@ -41,14 +41,14 @@ def experts_of(split: Path, level_ids: Int[np.ndarray, " level"]) -> KnownExpert
     with recorded_settings(split):
         known = manifest.config or {}
         config, stop = typed(ExpertConfig, known["expert"], "expert"), typed(StopConfig, known["stop"], "stop")
-        # Its levels are there already, so `level_files`: no distribution has to be able to make this size
+        # `level_files` skips the check that a distribution can make this size: the levels exist already
         job = JobConfig(
             size=rows[0]["size"], budget=str(known["budget"]), level_files=str(split), expert=config, stop=stop
         )
     params = {}
     for name, ids in by_file.items():
-        experts = load_experts(data_path(split, name), job, WITHOUT)
-        params |= {i: experts[i].begun.training.train_state.params for i in ids if i in experts}
+        experts = load_experts(data_path(split, name), job, ids, WITHOUT)
+        params |= {i: experts[i].begun.training.train_state.params for i in ids}
     row_of = {level_id: row for row, level_id in enumerate(params)}
     expert = np.array([row_of.get(level_id, -1) for level_id in level_ids.tolist()])
     return KnownExperts(config, jax.tree.map(lambda *xs: np.stack(xs), *params.values()), expert)

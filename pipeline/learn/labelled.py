@@ -35,7 +35,7 @@ def with_labels(buffer: LabelBuffer, level: Int[np.ndarray, " state"], labels: L
         buffer: unchanged.
         level: index of each state's level.
         labels: what teachers did in these states.
-        path: largest number of env steps of a label to add: its first, and others evenly spaced over its way.
+        path: maximum number of env steps to add per label, evenly spaced from its first to its last; 1: the first.
     """
     steps = [np.linspace(0, length - 1, min(path, length)).round().astype(int) for length in labels.length.tolist()]
     state = np.repeat(np.arange(len(steps)), [len(each) for each in steps])

@@ -118,22 +118,21 @@ def _of_split(split: Path, where: str | None, count: int | None) -> MeasuredLeve
     return MeasuredLevels(name, rows["level_id"].to_numpy(), levels, rules_of(manifest), solved)
 
 
-def midway_levels(split: Path, where: str | None, count: int | None, start: float) -> MeasuredLevels:
-    """Return the levels of a split that have a witness, each in the state at a share `start` of its way to the goal.
+def midway_levels(data: Dataset, count: int | None, start: float) -> MeasuredLevels:
+    """Return levels of a dataset that have a witness, each in the state at a share `start` of its way to the goal.
 
     Raises:
-        UserError: no level that meets the condition has a witness.
+        UserError: no level has a witness.
         Failure: the split is damaged.
     """
-    data = Dataset(split, where, (), 0.0)
     steps = data.manifest["steps_to_goal"]
     witnessed = np.flatnonzero(steps.is_valid().to_numpy())[:count]
     if not len(witnessed):
-        raise UserError(f"No level of {split} that meets the condition has a witness: choose others with --where.")
+        raise UserError(f"No level of {data.split} that meets the condition has a witness: choose another condition.")
     at = (steps.take(pa.array(witnessed)).to_numpy() * start).astype(np.int64)
     parts = [data.state(witnessed[i : i + AT_ONCE], at[i : i + AT_ONCE]).level for i in range(0, len(at), AT_ONCE)]
     levels = jax.tree.map(lambda *xs: np.moveaxis(np.concatenate(xs), 0, -1), *parts)
-    name = f"{as_typed(split)}, {name_of(data.size)}, {start:.0%} into witnesses"
+    name = f"{as_typed(data.split)}, {name_of(data.size)}, {start:.0%} into witnesses"
     solved = np.array([label == Label.SOLVED for label in data.manifest["label"].take(pa.array(witnessed)).to_pylist()])
     ids = data.manifest["level_id"].to_numpy()[witnessed]
     return MeasuredLevels(name, ids, levels, data.rules, solved, start)

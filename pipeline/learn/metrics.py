@@ -1,9 +1,11 @@
 """Metrics of a run: JSON lines and their curves beside the policy, and the logger that the setting `log` names."""
 
 import json
+import math
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -17,7 +19,7 @@ METRICS, CURVES, LOG = "metrics.jsonl", "curves.png", "log"
 
 
 class Metrics:
-    """Appends to `metrics.jsonl`, and draws it as `curves.png`.
+    """Appends to `metrics.jsonl`, and draws it as `curves.png`; its `with` block tells the logger how the run ended.
 
     If a logger fails, the user is told once, and the run continues without it.
     """
@@ -50,14 +52,14 @@ class Metrics:
         self._require_ours = require_ours
         self._path, self._curves, self._log = folder / METRICS, curves, GuardedLog(log, say)
         lines = read_regular(self._path).decode().splitlines() if os.path.lexists(self._path) else []
-        kept = [line for line in lines if line.endswith("}") and json.loads(line)[curves.step] <= steps]
+        kept = [line for line in lines if line.endswith("}") and json.loads(line).get(curves.step, math.inf) <= steps]
         write(self._path, "".join(f"{line}\n" for line in kept).encode())
         self.last: dict[str, float] = json.loads(kept[-1]) if kept else {}  # line that an earlier process wrote
         if log != "none":
             self._log.open(lambda: writer_of(log, folder / LOG, curves.step, folder.name, settings))
 
     def write(self, numbers: Mapping[str, float]) -> None:
-        """Append a line with the numbers that exist: NaN stands for one that does not, and is not JSON.
+        """Append a line without numbers that are not finite: NaN marks a missing one, and JSON has no NaN.
 
         Raises what `require_ours` raises.
         """
@@ -76,5 +78,8 @@ class Metrics:
         draw_curves(lines, self._curves, unfinished)
         unfinished.replace(path)
 
-    def close(self, done: bool) -> None:
-        self._log.use(lambda writer: writer.close(done))
+    def __enter__(self) -> "Metrics":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._log.use(lambda writer: writer.close(kind is None))

@@ -1,4 +1,4 @@
-"""How fast a run goes on."""
+"""Speed of a training run."""
 
 import time
 from collections.abc import Iterator
@@ -6,14 +6,14 @@ from contextlib import contextmanager
 
 
 class Pace:
-    """What is done per second, from the first count on: reading and compiling come before it, and do not count."""
+    """Items per second since the first `count`, which leaves out reading and compiling."""
 
     def __init__(self) -> None:
-        self._done: int | None = None  # since the first count; None: there was none
+        self._done: int | None = None  # items since the first count; None: not yet counted
         self._began = 0.0  # s
 
     def count(self, done: int) -> float:
-        """Count what has just been done. Return what is done per second since the first count; at that, 0."""
+        """Add finished items; return items per second since the first call, which returns 0."""
         now = time.monotonic()
         if self._done is None:
             self._done, self._began = 0, now
@@ -23,7 +23,7 @@ class Pace:
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """Leave out the time that passes within."""
+        """Exclude the time spent in the `with` block."""
         paused = time.monotonic()
         yield
         self._began += time.monotonic() - paused

@@ -69,7 +69,7 @@ def read_pool(
         network: decides whether contacts are read.
         whole: read whole records, not only up to each one's first goal.
         mirror: add the mirror images that solve their mirrored level.
-        follow: called with the number of levels in each read.
+        follow: called with the number of levels of each read.
     """
     names = (*MOTION_FIELDS, *([CONTACTS] if network.reads_contacts else []))
 
@@ -80,10 +80,10 @@ def read_pool(
         return _joined([pool, _cut(mirrored(batch, names, whole, data.rules), whole)]) if mirror else pool
 
     with ThreadPoolExecutor(len(own_cores())) as threads:
-        parts = []
-        for part in threads.map(read, (indices[i : i + AT_ONCE] for i in range(0, len(indices), AT_ONCE))):
+        parts, some = [], [indices[i : i + AT_ONCE] for i in range(0, len(indices), AT_ONCE)]
+        for mine, part in zip(some, threads.map(read, some), strict=True):
             parts.append(part)
-            follow(len(part.steps))
+            follow(len(mine))
     return _joined(parts)
 
 
@@ -113,20 +113,28 @@ def _cut(witnesses: Witnesses, whole: bool) -> LevelPool:
 class Feed:
     """The batches of all updates, read and drawn ahead by threads."""
 
-    def __init__(self, sources: Sequence[PartedSplit], config: CloneConfig, follow: Callable[[int], None]) -> None:
-        self._sources, self._config, self._follow = sources, config, follow
+    def __init__(self, sources: Sequence[PartedSplit], config: CloneConfig) -> None:
+        self._sources, self._config = sources, config
         counts = np.array([len(source.train) for source in sources])
         self._weights = counts / counts.sum()
         total = int(counts.sum())
         rounds = -(-total // config.pool)  # of an epoch, as equal as can be: its last one repeats few levels
         self._orders = [EpochOrder(count, -(-count // rounds), config.seed) for count in counts.tolist()]
 
-    def batches(self, first: int) -> Iterator[Transitions]:
-        """Yield the batches of all updates from number `first` on."""
+    @property
+    def levels(self) -> int:
+        """Number of levels that `read` reads."""
+        return sum(order.batch_size for order in self._orders)
+
+    def read(self, update: int, follow: Callable[[int], None] = lambda _: None) -> list[LevelPool]:
+        """Read the pools that an update draws from, one for each split; call `follow` as `read_pool` does."""
+        return self._read(self._turn(update), follow)
+
+    def batches(self, first: int, pools: list[LevelPool]) -> Iterator[Transitions]:
+        """Yield the batches of all updates from number `first` on, which draws from `pools`."""
         config = self._config
         with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as drawer:
             turn = self._turn(first)
-            pools = self._read(turn)
             coming = self._ahead(reader, turn)
             ahead = drawer.submit(self._draw, pools, first)
             for update in range(first, config.train.updates):
@@ -149,12 +157,12 @@ class Feed:
     def _turn(self, update: int) -> int:
         return update // self._config.refresh if self._changes else 0
 
-    def _read(self, turn: int) -> list[LevelPool]:
-        pools = []
+    def _read(self, turn: int, follow: Callable[[int], None] = lambda _: None) -> list[LevelPool]:
+        pools, network = [], self._config.network
         for source, order in zip(self._sources, self._orders, strict=True):
             items, _ = order.items(turn)  # an epoch's last round is padded with levels of its first
             whole, mirror = self._config.episodes == "all", self._config.mirror
-            pools.append(read_pool(source.data, source.train[items], self._config.network, whole, mirror, self._follow))
+            pools.append(read_pool(source.data, source.train[items], network, whole, mirror, follow))
         return pools
 
     def _draw(self, pools: Sequence[LevelPool], update: int) -> Transitions:

@@ -8,7 +8,6 @@ Rates and protocol: README of kinetix-env 3.0.2.
 import shutil
 import subprocess
 import sys
-import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -23,6 +22,7 @@ from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.learn.measured import MeasuredLevels, levels_in
 from levelproof.pipeline.runtime import cache_folder
+from levelproof.pipeline.store.scratch import scratch
 
 PACKAGE = "kinetix-env==3.0.2"
 HANDMADE, RANDOM = "handmade", "reference-random"
@@ -63,7 +63,7 @@ def published_levels(
     """Yield the levels of one of PROTOCOLS, by size, with the published rates; of each size the first `count`.
 
     Raises:
-        UserError: the reference has no levels of a size, or the levels cannot be had; the sentence says how.
+        UserError: the reference has no levels of a size, or the levels are not here; the message says how to get them.
         Failure: their file is damaged.
     """
     if unknown := [size for size in sizes if size not in SIZES]:
@@ -81,21 +81,29 @@ def handmade_folder(say: Callable[[str], None] = print) -> Path:
 
     Raises:
         UserError: they cannot be fetched.
+        Failure: they cannot be written, or the package lacks some.
     """
     folder = cache_folder() / "published" / HANDMADE
     if _is_whole(folder):
         return folder
     say(f"Fetching the handmade levels with the package {PACKAGE} (once).")
-    folder.parent.mkdir(exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder.parent) as temporary:
-        _fetch(Path(temporary))
-        unpacked = Path(temporary) / "kinetix" / "levels"
-        if not _is_whole(unpacked):
-            raise Failure(f"The package {PACKAGE} lacks some of the handmade levels: use another package index.")
+    try:
+        folder.parent.mkdir(exist_ok=True)
+        with scratch(folder.parent, f".{HANDMADE}-") as temporary:
+            _fetch(temporary)
+            unpacked = temporary / "kinetix" / "levels"
+            if not _is_whole(unpacked):
+                raise Failure(f"The package {PACKAGE} lacks some of the handmade levels: use another package index.")
+            if folder.exists() and not _is_whole(folder):
+                shutil.rmtree(folder)
+            unpacked.rename(folder)
+    except OSError as error:
         if _is_whole(folder):  # another process was faster
             return folder
-        shutil.rmtree(folder, ignore_errors=True)
-        unpacked.rename(folder)
+        raise Failure(
+            f"Cannot write the handmade levels to {folder} ({error.strerror}): make room there, or set "
+            "LEVELPROOF_CACHE_DIR to another folder."
+        ) from None
     return folder
 
 
@@ -141,5 +149,7 @@ def _random(size: str, count: int | None) -> MeasuredLevels:
         raise Failure(f"The file {path} is damaged ({error}): delete it and write it again.") from None
     ids = np.array(list(map(level_id_for, content_hashes(levels))))
     if levels.size != SIZES[size] or len(ids) != RANDOM_LEVELS:
-        raise Failure(f"The file {path} does not have {RANDOM_LEVELS} levels of size {size}: write it again.")
+        raise Failure(
+            f"The file {path} does not have {RANDOM_LEVELS} levels of size {size}: delete it and write it again."
+        )
     return MeasuredLevels(RANDOM, ids, levels, DEFAULT_RULES, None).first(count)

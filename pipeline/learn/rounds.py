@@ -130,7 +130,7 @@ def shown_by_experts(
     known = np.flatnonzero(taught.experts.expert >= 0)
     if not config.demonstrations:
         return
-    # Another order than that of the levels that the learner plays
+    # An order independent of that of the levels that the learner plays
     order = EpochOrder(len(known), min(len(known), config.demonstrations), config.seed + SHOWING)
     level = known[order.items(number)[0]]
     for first in range(0, len(level), SHOWN_AT_ONCE):

@@ -47,7 +47,8 @@ def specialists_of(split: Path, level_ids: Int[np.ndarray, " level"], attempts: 
     rates = table.filter(pc.field("label") == Label.SOLVED)["success_rate"]
     if len(rates) and rates.null_count == len(rates):
         raise UserError(
-            f"{split} has no success rates, as after procedure=label: name a split of another procedure with --experts."
+            f"{split} has no success rates, because procedure=label does not measure them: name a split made with "
+            "another procedure with --experts."
         )
     own = config.get("expert", {}).get("attempts", ATTEMPTS)
     solved = _drawn(successes_of(rows, own), own, attempts)

@@ -9,7 +9,6 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from levelproof.configs.convert import plain
 from levelproof.configs.train import TrainConfig
 from levelproof.experts.generalist.curricula import UNIFORM, Curriculum
 from levelproof.experts.generalist.evolve import evolve
@@ -28,22 +27,22 @@ from levelproof.pipeline.learn.curves import BLUE, GREEN, Curves, Panel
 from levelproof.pipeline.learn.folder import (
     continued,
     keep_run,
-    made,
     note_in,
     require_finite,
     require_same_run,
+    settings_without,
     shown,
+    tell_done,
     weights_digest,
     with_stack,
     write_note,
+    writing_run,
 )
 from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.pace import Pace
 from levelproof.pipeline.learn.trained_on import TrainingLevels, levels_for
 from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.runtime import own_cores, prepare_jax
-from levelproof.pipeline.store.disk import explaining_writes
-from levelproof.pipeline.store.locks import only_clone
 from levelproof.pipeline.words import duration
 
 COURSE = Curves(
@@ -76,7 +75,7 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
     recipe = recipe_of(config, source, start, cores)
     note = note_of(config, source, cores)
     params = None if start is None else start.params
-    with explaining_writes(out), only_clone(made(out)) as require_ours:
+    with writing_run(out) as require_ours:
         require_same_run(out, note, LATER)
         table = table_of(source.levels, recipe.rules)
         programs = programs_of(recipe, table, params, cores)
@@ -86,7 +85,6 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
         if int(learner.updates) > config.ppo.updates:
             raise UserError(f"{out} has {steps:,} env steps of training already: set a larger ppo.env_steps.")
         write_note(out, note := with_stack(out, note, tell))
-        metrics, done = Metrics(out, COURSE, config.log, note, steps, tell, require_ours), False
 
         def save(learner: Learner) -> None:
             require_ours()
@@ -95,15 +93,12 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
             origin |= {"start_origin": dict(start.origin)} if start else {}
             keep_run(out, Policy(recipe.network, learner.average, fits, origin), learner)
 
-        try:
+        with Metrics(out, COURSE, config.log, note, steps, tell, require_ours) as metrics:
             learner = update_until_done(
                 programs, learner, table, params, recipe, config.interval, save, metrics, console
             )
-            done = True
-        finally:
-            metrics.close(done)
         save(learner)
-    tell(f"The policy is in {out}. Next: levelproof evaluate {out}")
+    tell_done(out, tell)
 
 
 def prepared_cores(config: TrainConfig, note: dict[str, Any] | None) -> int:
@@ -113,8 +108,8 @@ def prepared_cores(config: TrainConfig, note: dict[str, Any] | None) -> int:
         UserError: JAX has fewer devices than that.
     """
     noted = (note or {}).get("cores", 0)
-    wanted = noted if noted and config.ppo.shares_out(noted) else config.cores  # else it is another run's folder
-    even = next((cores for cores in range(len(own_cores()), 1, -1) if config.ppo.shares_out(cores)), 1)
+    wanted = noted if noted and config.ppo.divides_evenly(noted) else config.cores  # else it is another run's folder
+    even = next((cores for cores in range(len(own_cores()), 1, -1) if config.ppo.divides_evenly(cores)), 1)
     prepare_jax(devices=wanted or even)
     if jax.default_backend() != "cpu":
         return 1
@@ -150,7 +145,7 @@ def curriculum_of(config: TrainConfig, levels: Level | Sampler, rules: TaskParam
 
 def note_of(config: TrainConfig, source: TrainingLevels, cores: int) -> dict[str, Any]:
     """Return what decides a run's result, as JSON."""
-    settings = {name: value for name, value in plain(config).items() if name not in WITHOUT_EFFECT}
+    settings = settings_without(config, WITHOUT_EFFECT)
     return {
         "settings": settings,
         "levels": source.facts,
@@ -195,7 +190,7 @@ def update_until_done(
                 with pace.aside():
                     numbers = {COURSE.step: update * per_update, "train/updates": update} | averages(recent)
                     numbers |= recipe.curriculum.facts(learner.curriculum)
-                    numbers["train/env_steps_per_second"] = rate
+                    numbers["train/env_steps_per_second"] = rate or np.nan  # unknown
                     numbers["train/core_seconds"] = before + time.process_time()
                     require_finite(numbers["loss/value"], "ppo.learning_rate")
                     recent = []

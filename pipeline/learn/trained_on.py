@@ -16,6 +16,7 @@ from levelproof.levelgen.identity.content import content_hashes
 from levelproof.levelgen.level import Level, name_of
 from levelproof.levelgen.sampling.sampler import Sampler, sampler
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
+from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.learn.measured import MeasuredLevels, is_split, levels_in, midway_levels
 from levelproof.pipeline.learn.sealed import require_not_sealed, require_some_usable, without_sealed
@@ -73,7 +74,8 @@ def _groups(config: TrainConfig, tell: Callable[[str], None]) -> list[MeasuredLe
     """Return the levels of a split or of files; of a split the levels' start first, then each state midway."""
     place, where = Path(config.levels), config.where or None
     if is_split(place) and config.starts > 1:
-        return [midway_levels(place, where, None, share / config.starts) for share in range(config.starts)]
+        data = Dataset(place, where, (), 0.0)
+        return [midway_levels(data, None, share / config.starts) for share in range(config.starts)]
     if config.starts > 1:
         raise UserError(f"starts={config.starts} needs witnesses, but {place} is not a split: leave it out.")
     if not is_split(place) and config.where != TrainConfig.where:

@@ -91,8 +91,8 @@ def _origin_of(path: Path, job: JobConfig) -> Origin:
         raise LevelFileError(f"Cannot use the level file {path}: {error!s:.300}") from None
     if other := _other_rules(file, job):
         raise LevelFileError(
-            f"Cannot use the level file {path}: its rules differ from this command's. This labels it, separately "
-            f"from files with other rules: levelproof generate {shlex.quote(f'level_files={path}')} {' '.join(other)}"
+            f"Cannot use the level file {path}: its rules differ from this command's, so label it "
+            f"separately: levelproof generate {shlex.quote(f'level_files={path}')} {' '.join(other)}"
         )
     return Origin(content_hashes(file.level)[0], str(path), size)
 
@@ -134,8 +134,7 @@ def levels_at(origins: Sequence[Origin]) -> Level:
         for origin, content_hash in zip(origins, content_hashes(levels), strict=True):
             if content_hash != origin.content_hash:
                 raise LevelUnavailable(
-                    f"The seed file {source} has changed: its level {origin.level_id} is another one now, so restore "
-                    "the file."
+                    f"The seed file {source} has changed: its level {origin.level_id} differs now, so restore the file."
                 )
         return levels
     return jax.tree.map(lambda *lanes: np.concatenate(lanes, -1), *map(level_at, origins))

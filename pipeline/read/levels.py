@@ -106,7 +106,7 @@ def check_sampler(manifest: Manifest) -> None:
             "use the levelproof that made the split."
         )
     warnings.warn(
-        f"{what} {SAMPLER_VERSION}: those without a witness differ in the last places of their numbers.",
+        f"{what} {SAMPLER_VERSION}: those without a witness differ in the last digits of their numbers.",
         SamplerDiffers,
         stacklevel=3,
     )
@@ -136,7 +136,7 @@ def recorded_settings(split: Path) -> Iterator[None]:
         yield
     except (ValueError, KeyError, TypeError) as error:
         raise Failure(
-            f"The split {split} was made by a levelproof with other settings ({error}): use that one."
+            f"This levelproof does not accept the settings of {split} ({error}): use the version that made it."
         ) from None
 
 

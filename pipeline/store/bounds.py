@@ -61,7 +61,7 @@ def unread(path: Path, error: BaseException | None) -> DataUnread | None:
     if not isinstance(error, OSError) or error.errno in (None, *ABSENT):  # Arrow's errors of damage have no number
         return None
     reason = error.strerror or type(error).__name__
-    return DataUnread(f"{path} cannot be read ({reason}): mend that, then run the same command again.")
+    return DataUnread(f"{path} cannot be read ({reason}): fix that, then run the same command again.")
 
 
 @dataclass(frozen=True, eq=False)

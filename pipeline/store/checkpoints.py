@@ -1,7 +1,7 @@
 """Trained experts on disk, from which a larger budget continues: one numpy archive per unit."""
 
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import IO, TypeVar
@@ -54,12 +54,14 @@ def save_experts(path: Path, experts: Mapping[int, KeptExpert]) -> None:
     flush(path)
 
 
-def load_experts(path: Path, job: JobConfig, without: str = RESTART) -> dict[int, KeptExpert]:
+def load_experts(
+    path: Path, job: JobConfig, wanted: Iterable[int] = (), without: str = RESTART
+) -> dict[int, KeptExpert]:
     """Load all experts of a checkpoint, by level id; `without` ends the message if they cannot be read.
 
     Raises:
         UserError: other users can write to it.
-        Failure: it is damaged or missing, or another version of this program wrote it.
+        Failure: it is damaged or missing, lacks a level of `wanted`, or another version of this program wrote it.
     """
     require_own(path, COPY)
     try:
@@ -72,6 +74,8 @@ def load_experts(path: Path, job: JobConfig, without: str = RESTART) -> dict[int
         if (level_ids.dtype, level_ids.ndim, curves.ndim, len(curves)) != (np.int64, 1, 2, len(level_ids)):
             raise ValueError("its level ids or curves are invalid")
         level_id_array(level_ids)  # checks their bounds
+        if lacking := set(wanted) - set(level_ids.tolist()):
+            raise ValueError(f"level {min(lacking)} is missing")
         begun = unstacked(arrays, "begun/", begun_like(job), len(level_ids))
     except Exception as error:  # numpy and zipfile raise many kinds
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
@@ -142,7 +146,7 @@ def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, KeptExper
             paths.setdefault(path, set()).add(level_id)
     unsolved: dict[int, KeptExpert] = {}
     for path, ids in paths.items():
-        experts = load_experts(data_path(source, path), job)
+        experts = load_experts(data_path(source, path), job, ids)
         unsolved |= {i: experts[i] for i in ids if not experts[i].begun.training.course.solved}
     return unsolved
 

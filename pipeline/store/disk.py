@@ -76,8 +76,10 @@ def write_new(path: Path, data: bytes, mode: int = 0o666) -> None:
 
 
 @contextmanager
-def explaining_writes(split: Path) -> Iterator[None]:
-    """Turn errors of failed writes to a split in the `with` block into a Failure that says what to do.
+def explaining_writes(folder: Path, kept: str = "what is committed stays") -> Iterator[None]:
+    """Turn errors of failed writes to a folder in the `with` block into a Failure that says what to do.
+
+    `kept` is the clause that says what the failed write has not touched.
 
     Raises:
         Failure: a write fails.
@@ -85,9 +87,9 @@ def explaining_writes(split: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if not (sentence := refusal(error, split, REFUSALS | FAILS)):
+        if not (sentence := refusal(error, folder, REFUSALS | FAILS)):
             raise
-        raise Failure(f"{sentence}; nothing is lost.") from error
+        raise Failure(f"{sentence}; {kept}.") from error
 
 
 def refusal(error: OSError, folder: Path, reasons: Mapping[int, str] = REFUSALS) -> str:
@@ -97,7 +99,7 @@ def refusal(error: OSError, folder: Path, reasons: Mapping[int, str] = REFUSALS)
     """
     reason, file = reasons.get(error.errno or 0), error.filename
     where = os.fsdecode(file) if isinstance(file, str | bytes | os.PathLike) else folder
-    return f"Cannot write to {where}, {reason}, then run the same command again" if reason else ""
+    return f"Cannot write to {where}, because {reason}, then run the same command again" if reason else ""
 
 
 def flush(path: Path) -> None:

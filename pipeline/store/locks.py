@@ -50,7 +50,7 @@ def only_writer(split: Path, say: Callable[[str], None]) -> Iterator[None]:
 
 
 @contextmanager
-def only_clone(folder: Path) -> Iterator[Callable[[], None]]:
+def only_trainer(folder: Path) -> Iterator[Callable[[], None]]:
     """Hold the writer lock of a policy's folder, which exists; yield a function to call before each write.
 
     It raises Failure if the folder was removed or recreated, perhaps by a command that now holds its lock.
@@ -63,7 +63,9 @@ def only_clone(folder: Path) -> Iterator[Callable[[], None]]:
         try:
             taken = _taken_within(PATIENCE, file)
         except LockRefused:
-            raise UserError(f"The file system of {folder} has no locks: choose another one with -o.") from None
+            raise UserError(
+                f"The file system of {folder} has no locks: choose a folder on another one with -o."
+            ) from None
         if not taken:
             raise UserError(f"Another command is writing a policy to {folder}: wait for it, or choose another -o.")
 

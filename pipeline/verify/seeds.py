@@ -5,7 +5,7 @@ from pathlib import Path
 from rich.console import Console
 
 from levelproof.levelgen.sampling.sampler import CHUNK
-from levelproof.pipeline.read.pace import ProgressBar
+from levelproof.pipeline.read.progress_bar import ProgressBar
 from levelproof.pipeline.store.checksums import has_own
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.seed.columns import ROW_GROUP

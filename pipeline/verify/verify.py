@@ -29,7 +29,7 @@ from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.errors import Exit, Failure
 from levelproof.pipeline.read.level_files import level_at
 from levelproof.pipeline.read.levels import recorded_settings
-from levelproof.pipeline.read.pace import ProgressBar
+from levelproof.pipeline.read.progress_bar import ProgressBar
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.bounds import DAMAGE, MAX_ROWS, DataUnread, bounded, unread
 from levelproof.pipeline.store.checksums import digests_of, has_own

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -11,7 +11,8 @@ import pyarrow as pa
 from jaxtyping import Bool, Int
 
 from levelproof.experts.witness.episode import play_episodes, repeated_rows
-from levelproof.levelgen.level import Level, name_of
+from levelproof.levelgen.batching import take
+from levelproof.levelgen.level import Level, concatenate_levels, name_of
 from levelproof.levelgen.task.observe.kinds import ObservationType
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.density import Restored
@@ -23,6 +24,7 @@ from levelproof.pipeline.store.seed.packed import unpack_witnesses
 from levelproof.pipeline.store.seed.source import LevelSource
 from levelproof.pipeline.store.shard import Part, Shard
 
+T = TypeVar("T")
 COLUMNS = ("label", "steps_to_goal", "witness", "checksum")
 RECORD = "record/"
 
@@ -34,7 +36,7 @@ class SeedEpisodes(NamedTuple):
     steps: Int[np.ndarray, " level"]
     rows: dict[str, np.ndarray]  # fields of records, [row, ...]
     observation: Any  # of the state before each action, [row, ...]; None if not requested
-    wrong: Bool[np.ndarray, " level"]  # whether the engine here plays another episode than the one that was stored
+    wrong: Bool[np.ndarray, " level"]  # whether this machine's engine plays another episode than the stored one
 
 
 class SeedShard(Shard):
@@ -129,16 +131,24 @@ def stored_levels(source: Path, level_ids: np.ndarray) -> Level:
     Raises:
         Failure: a file is damaged or missing.
     """
-    contents: dict[int, bytes | None] = {}
-    config, path = None, source
+    parts, found = [], []
     for path in seed_files(source):
         about, rows = read_seed(path, ["content"], np.sort(level_ids))
-        config = about.fragment.config
-        contents |= dict(zip(rows.column("level_id").to_pylist(), rows.column("content").to_pylist(), strict=True))
-    try:
-        return LevelSource.of(config or {}, path).levels(level_ids, [contents.get(i) for i in level_ids.tolist()])
-    except ValueError as error:
-        raise damaged_seed(path, error) from error
+        rows = rows.filter(pa.array(np.isin(rows.column("level_id").to_numpy(), level_ids)))
+        if not rows.num_rows:
+            continue
+        ids = rows.column("level_id").to_numpy()
+        try:
+            levels = LevelSource.of(about.fragment.config, path).levels(ids, rows.column("content").to_pylist())
+        except ValueError as error:
+            raise damaged_seed(path, error) from error
+        parts.append(levels)
+        found += ids.tolist()
+    row_of = {level_id: row for row, level_id in enumerate(found)}
+    if missing := set(level_ids.tolist()) - row_of.keys():
+        raise damaged_seed(source, ValueError(f"level {min(missing)} is missing"))
+    rows = np.array([row_of[level_id] for level_id in level_ids.tolist()])
+    return take(concatenate_levels(parts), rows)
 
 
 def play_seeds(
@@ -164,10 +174,7 @@ def play_seeds(
         _joined([getattr(shard, name)[np.asarray(rows)] for shard, rows in parts], order)
         for name in ("steps", "checksum")
     )
-    try:
-        action = _joined([shard.actions(rows) for shard, rows in parts], order)
-    except ValueError as error:
-        raise damaged_seed(parts[0][0].path, error) from error
+    action = _joined(_each(parts, SeedShard.actions), order)
     wanted = frozenset(name.removeprefix(RECORD) for name in names if name.startswith(RECORD))
     made = play_episodes(level, action, steps, parts[0][0].encoding.rules, wanted, observation)
     rows = {f"{RECORD}{name}": x for name, x in made.fields.items()}
@@ -177,11 +184,18 @@ def play_seeds(
 
 def _levels(parts: Sequence[SeedPart], order: np.ndarray | None) -> Level:
     """Make the levels of rows, level axis last."""
-    try:
-        each = [shard.levels(rows) for shard, rows in parts]
-    except ValueError as error:
-        raise damaged_seed(parts[0][0].path, error) from error
-    return jax.tree.map(lambda *xs: _joined(xs, order), *each)
+    return jax.tree.map(lambda *xs: _joined(xs, order), *_each(parts, SeedShard.levels))
+
+
+def _each(parts: Sequence[SeedPart], make: Callable[[SeedShard, Sequence[int]], T]) -> list[T]:
+    """Apply `make` to the rows of each file. Raise Failure for the file whose rows are invalid."""
+    made = []
+    for shard, rows in parts:
+        try:
+            made.append(make(shard, rows))
+        except ValueError as error:
+            raise damaged_seed(shard.path, error) from error
+    return made
 
 
 def _order(places: Sequence[Sequence[int]]) -> np.ndarray | None:

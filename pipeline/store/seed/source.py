@@ -80,8 +80,7 @@ class LevelSource:
         sampler = config.get("sampler_version")
         if distribution is not None and sampler != SAMPLER_VERSION:
             raise ConfigError(
-                f"has levels that version {sampler!r:.9} of the sampler made, and this program makes those of version "
-                f"{SAMPLER_VERSION}"
+                f"has levels from sampler version {sampler!r:.9}, but this levelproof has version {SAMPLER_VERSION}"
             )
         return LevelSource(path, size, distribution, rules)
 

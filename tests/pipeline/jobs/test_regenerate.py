@@ -100,6 +100,8 @@ def test_load_experts_names_a_damaged_file(folder: Path, tmp_path: Path) -> None
         copy.write_bytes(damaged)
         with pytest.raises(Failure, match=r"experts in .*damaged cannot be read .* leave out continue_from"):
             load_experts(copy, made_job("data", *SETTINGS, "budget=8k"))
+    with pytest.raises(Failure, match=r"cannot be read \(level 999 is missing\)"):
+        load_experts(path, made_job("data", *SETTINGS, "budget=8k"), [999])
     with pytest.raises(Failure, match=r"cannot be read \(.* has another shape or type\)"):
         load_experts(path, made_job("data", *SETTINGS, "budget=8k", "expert.width=64"))
 

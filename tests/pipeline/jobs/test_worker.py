@@ -212,7 +212,7 @@ def test_full_disk_is_fatal(tmp_path: Path, job: JobConfig, monkeypatch: pytest.
     full = OSError(errno.ENOSPC, "No space left on device")
     monkeypatch.setattr(worker_module, "finish_unit", failing(None, full))
     results = outcomes(Worker(job, tmp_path), UNITS[1:2])
-    assert results[UNITS[1]].fatal.startswith(f"Cannot write to {tmp_path}, the disk is full")
+    assert results[UNITS[1]].fatal.startswith(f"Cannot write to {tmp_path}, because the disk is full")
 
 
 def test_failing_step_fails_running_units_but_no_later_one(

@@ -29,7 +29,7 @@ from levelproof.pipeline.learn.curves import draw_curves
 from levelproof.pipeline.learn.pool import Feed, read_pool
 from levelproof.pipeline.learn.sealed import SEALED
 from levelproof.pipeline.runtime import CACHE_VARIABLE
-from levelproof.pipeline.store.locks import only_clone
+from levelproof.pipeline.store.locks import only_trainer
 from tests.pipeline.command import assert_refused, here
 from tests.pipeline.learn.runs import assert_guide_lists, metrics
 from tests.pipeline.made import played_split
@@ -163,7 +163,8 @@ def test_levels_weigh_equally_and_end_at_their_first_goal(split: Path) -> None:
     level_of = {np.ascontiguousarray(pool.level.model.vertices[..., i]).tobytes(): i for i in range(len(ends))}
     assert len(level_of) == len(ends)
     drawn = np.zeros(len(ends), int)
-    for batch in Feed([source], config, lambda _: None).batches(0):
+    feed = Feed([source], config)
+    for batch in feed.batches(0, feed.read(0)):
         for lane in range(config.train.batch):
             drawn[level_of[np.ascontiguousarray(batch.level.model.vertices[..., lane]).tobytes()]] += 1
     expected = drawn.sum() / len(ends)
@@ -175,7 +176,7 @@ def test_levels_are_read_equally_often_if_memory_holds_two_thirds_of_them(split:
     source = module.source_of(split, config, lambda _: None)
     count = len(source.train) // 2 * 2
     source = source._replace(train=source.train[:count])
-    (order,) = Feed([source], replace(config, pool=count * 2 // 3), lambda _: None)._orders
+    (order,) = Feed([source], replace(config, pool=count * 2 // 3))._orders
     items, _ = order.items(range(2))
     assert sorted(items.tolist()) == list(range(count)), "each once in an epoch of two rounds"
 
@@ -239,7 +240,7 @@ def test_pool_may_have_no_mirror_image(split: Path, monkeypatch: pytest.MonkeyPa
 
 def test_second_clone_is_refused_where_one_runs(split: Path, tmp_path: Path) -> None:
     (tmp_path / "policy").mkdir()
-    with only_clone(tmp_path / "policy"):
+    with only_trainer(tmp_path / "policy"):
         assert_refused(here(["clone", str(split), "where="], tmp_path), 2, "Another command is writing")
     assert not (tmp_path / "policy" / "run.json").exists()
 
@@ -268,7 +269,7 @@ def test_copies_of_sealed_levels_are_left_out(tmp_path: Path, monkeypatch: pytes
         others = np.flatnonzero(source.data.manifest["level_id"].to_numpy() >= 16)
         assert 1 < source.copies == len(source.data) - len(others)
         assert sorted([*source.train, *source.validation]) == others.tolist()
-        assert f"{source.copies} levels left out" in messages.pop()
+        assert f"Left out {source.copies} levels of" in messages.pop()
         monkeypatch.setattr("levelproof.pipeline.learn.sealed.content_hashes", None)
     (kept,) = (tmp_path / "cache" / "sealed").iterdir()
     kept.write_text("[]")

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from rich.console import Console
 from safetensors.numpy import load_file
 
 import levelproof
@@ -244,8 +245,8 @@ class _With:
 
 
 def test_levels_are_witnessed_and_neither_trivial_nor_sealed(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config, messages = DistillConfig(), []
-    taught = module.levels_for(split, config, NetworkConfig(), messages.append)
+    config, quiet = DistillConfig(), Console(quiet=True)
+    taught = module.levels_for(split, config, NetworkConfig(), quiet)
     data = levelproof.open(split, where="label = 'solved'")
     ids = data.manifest["level_id"].to_numpy()
     assert np.array_equal(taught.level_ids, ids)
@@ -255,15 +256,15 @@ def test_levels_are_witnessed_and_neither_trivial_nor_sealed(split: Path, monkey
         first = int(np.argmax(stored.done[i])) + 1
         assert np.array_equal(witness[:first, :, i], stored.action[i, :first])
         assert (witness[first:, :, i] == stored.action[i, first - 1]).all()
-    few = module.levels_for(split, DistillConfig(pool=3), NetworkConfig(), print)
+    few = module.levels_for(split, DistillConfig(pool=3), NetworkConfig(), quiet)
     assert len(few.level_ids) == len(few.levels) == len(few.witnesses.steps) == 3
     monkeypatch.setattr(module, "Label", type("Trivial", (), {"TRIVIAL": Label.SOLVED}))
     with pytest.raises(levelproof.UserError, match="only trivial levels"):
-        module.levels_for(split, config, NetworkConfig(), print)
+        module.levels_for(split, config, NetworkConfig(), quiet)
     monkeypatch.undo()
     monkeypatch.setattr(sealed, "SEALED", range(int(ids[0]), int(ids[0]) + 1))
     with pytest.raises(levelproof.UserError, match="sealed to measure policies"):
-        module.levels_for(split, config, NetworkConfig(), print)
+        module.levels_for(split, config, NetworkConfig(), quiet)
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from levelproof.levelgen.files.level_file import LevelFile, write_level_file
 from levelproof.levelgen.level import SIZES, size_of
 from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.levelgen.task.rules import DEFAULT_RULES
+from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.exchange.level_json import export
 from levelproof.pipeline.learn import published
@@ -65,7 +66,7 @@ def test_experts_of_a_split_stand_beside_the_baselines(split: Path, tmp_path: Pa
     assert specialists_of(split, ids, 3).solved.shape == (len(ids), 3)
     with pytest.raises(UserError, match=r"lacks 1 of the levels, such as 2000000000:"):
         specialists_of(split, np.array([ids[0], 2_000_000_000]), 1)
-    with pytest.raises(UserError, match="16k/m has no success rates, as after procedure=label"):
+    with pytest.raises(UserError, match="16k/m has no success rates, because procedure=label"):
         specialists_of(ROOT / "manifests" / "16k" / "m", np.arange(3), 1)
     words = "--on", str(split), "--experts", str(split), str(split), "--levels", "4", *ONCE
     (group,) = facts(tmp_path, *words)["levels"]
@@ -340,7 +341,7 @@ def test_linked_log_of_looks_is_left_alone(tmp_path: Path) -> None:
 def test_attempts_start_within_witnesses(tmp_path: Path) -> None:
     """What is left of a witness solves its level from there, in as many steps as are left."""
     split = honest_split(tmp_path / "data", 32, 1)
-    group = midway_levels(split, None, None, 0.5)
+    group = midway_levels(Dataset(split, None, (), 0.0), None, 0.5)
     data = levelproof.open(split)
     rows = [data.manifest["level_id"].to_pylist().index(level_id) for level_id in group.level_ids.tolist()]
     steps = np.array([data.manifest["steps_to_goal"][row].as_py() for row in rows])

@@ -24,7 +24,9 @@ from levelproof.pipeline.learn.folder import (
     shown,
     with_stack,
     write_note,
+    writing_run,
 )
+from levelproof.pipeline.store.layout import WRITER_LOCK
 
 STATE = {"step": np.int32(3)}
 
@@ -72,8 +74,27 @@ def test_a_file_gets_kept_lines_and_one_every_half_minute(monkeypatch: pytest.Mo
     assert text.getvalue().splitlines() == ["update 30", "update 40", "update 70", "update 100"]
 
 
+def test_run_that_saved_nothing_gives_way_to_other_settings(tmp_path: Path) -> None:
+    write_note(tmp_path, {"settings": {"seed": 0}})
+    require_same_run(tmp_path, {"settings": {"seed": 1}})
+    (tmp_path / CHECKPOINT).touch()
+    with pytest.raises(UserError, match="seed was 0, now 1"):
+        require_same_run(tmp_path, {"settings": {"seed": 1}})
+
+
+def test_what_a_killed_command_left_is_removed(tmp_path: Path) -> None:
+    out = tmp_path / "policy"
+    out.mkdir()
+    for name in (f".{CHECKPOINT}.123", f".{RUN}.123", "mine.123"):
+        (out / name).touch()
+    with writing_run(out) as require_ours:
+        require_ours()
+    assert {path.name for path in out.iterdir()} == {"mine.123", WRITER_LOCK}
+
+
 def test_run_that_another_stack_began_continues_and_says_so(tmp_path: Path) -> None:
     told = list[str]()
+    (tmp_path / CHECKPOINT).touch()
     write_note(tmp_path, here := with_stack(tmp_path, {"settings": {"seed": 0}}, told.append))
     assert with_stack(tmp_path, {"settings": {"seed": 0}}, told.append) == here
     assert not told
@@ -81,7 +102,9 @@ def test_run_that_another_stack_began_continues_and_says_so(tmp_path: Path) -> N
     write_note(tmp_path, {"settings": {"seed": 0}, MADE_BY: [stack | {"jax": "0.9"}]})
     require_same_run(tmp_path, {"settings": {"seed": 0}})
     assert with_stack(tmp_path, {"settings": {"seed": 0}}, told.append)[MADE_BY] == [stack | {"jax": "0.9"}, stack]
-    assert told == ["This run was begun with jax 0.9, so its policy will differ from that of an uninterrupted run."]
+    assert told == [
+        "This run was last trained with jax 0.9, so its policy may differ from that of an uninterrupted run."
+    ]
     with pytest.raises(UserError, match=r"has a run with other settings or levels \(seed was 0, now 1\): repeat"):
         require_same_run(tmp_path, {"settings": {"seed": 1}})
     with pytest.raises(UserError, match=r"levels \(the levels or the start differ\): repeat"):

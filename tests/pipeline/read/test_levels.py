@@ -41,5 +41,5 @@ def test_rules_of_and_distribution_of_report_settings_of_another_version(
     split_manifest = read_manifest(made_split(tmp_path, [[Label.SOLVED]]), [])
     (fragment,) = split_manifest.fragments
     config = {group: settings} if settings else {}
-    with pytest.raises(Failure, match="was made by a levelproof with other settings"):
+    with pytest.raises(Failure, match="does not accept the settings of"):
         read(replace(split_manifest, fragments=(replace(fragment, config=config),)))

@@ -65,7 +65,9 @@ def kept_experts() -> dict[int, KeptExpert]:
 )
 def test_explaining_writes_turns_failed_writes_into_sentences(tmp_path: Path, code: int, words: str) -> None:
     with (
-        pytest.raises(Failure, match=f"^Cannot write to {tmp_path}, {words}.* same command again"),
+        pytest.raises(
+            Failure, match=f"^Cannot write to {tmp_path}, because {words}.* same command again; what is committed stays"
+        ),
         explaining_writes(tmp_path),
     ):
         raise OSError(code, "refused")
@@ -76,7 +78,7 @@ def test_explaining_writes_turns_failed_writes_into_sentences(tmp_path: Path, co
 @pytest.mark.skipif(sys.platform != "linux", reason="needs a file that even root cannot write to")
 def test_explaining_writes_names_the_file_that_cannot_be_written(tmp_path: Path) -> None:
     elsewhere = Path("/proc/sys/kernel/version")
-    words = f"^Cannot write to {elsewhere}, writing is not permitted.* same command again"
+    words = f"^Cannot write to {elsewhere}, because writing is not permitted.* same command again"
     with pytest.raises(Failure, match=words), explaining_writes(tmp_path):
         elsewhere.write_bytes(b"")
     with pytest.raises(OSError, match="version") as refused:

@@ -24,7 +24,7 @@ from levelproof.pipeline.store.locks import (
     LockRefused,
     committing,
     is_written,
-    only_clone,
+    only_trainer,
     only_writer,
     without_commits,
 )
@@ -59,16 +59,16 @@ def test_committing_refuses_workers_of_an_earlier_writer(tmp_path: Path, monkeyp
         tmp_path.mkdir()
 
 
-def test_only_clone_notices_that_its_folder_was_recreated(tmp_path: Path) -> None:
+def test_only_trainer_notices_that_its_folder_was_recreated(tmp_path: Path) -> None:
     folder = tmp_path / "policy"
     folder.mkdir()
-    with only_clone(folder) as require_ours:
+    with only_trainer(folder) as require_ours:
         require_ours()
         shutil.rmtree(folder)
         with pytest.raises(Failure, match="policy was removed"):
             require_ours()
         folder.mkdir()
-        with only_clone(folder) as theirs:
+        with only_trainer(folder) as theirs:
             theirs()
             with pytest.raises(Failure, match="removed or recreated"):
                 require_ours()

@@ -285,7 +285,7 @@ def test_full_disk_of_temporary_files_is_named_instead_of_the_store(
     def fail(*_: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    words = f"^Cannot write to {tempfile.gettempdir()}, the disk is full"
+    words = f"^Cannot write to {tempfile.gettempdir()}, because the disk is full"
     with pytest.raises(Failure, match=words), locked(THERE, print):
         fail()
     monkeypatch.setattr(jobs_seal, "seal", fail)

@@ -20,7 +20,7 @@ from levelproof.experts.labels import Label
 from levelproof.experts.witness.episode import repeated_rows
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.pipeline.dataset.batch import Batch
-from levelproof.pipeline.errors import Exit, UserError
+from levelproof.pipeline.errors import Exit, Failure, UserError
 from levelproof.pipeline.exchange.seed import export_seed
 from levelproof.pipeline.jobs.grow import _job, grow
 from levelproof.pipeline.jobs.grower import Grower, grow_unit
@@ -29,6 +29,7 @@ from levelproof.pipeline.store.fields import arrays_of
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.seed.columns import SCHEMA, WRITTEN
 from levelproof.pipeline.store.seed.packed import MAX_RUN, pack_witness, unpack_witnesses
+from levelproof.pipeline.store.seed.shard import SeedShard, play_seeds
 from levelproof.pipeline.store.seed.worlds import pack_worlds, unpack_worlds
 from levelproof.pipeline.verify.verify import examine
 from tests.pipeline.made import assert_same, honest_split, made_level, made_split
@@ -316,6 +317,17 @@ def test_worker_that_does_not_find_the_seed_file_ends_the_job(seed: Path, tmp_pa
         assert f"does not find level {missing} in the seed files at {path}: put them into a folder" in outcome.fatal
 
 
+def test_the_file_with_an_invalid_row_is_named(seed: Path, tmp_path: Path) -> None:
+    rows = read_manifest(seed, ["label"]).table
+    labels = rows.column("label").to_pylist()
+    other = tmp_path / "other.parquet"
+    other.write_bytes(seed.read_bytes())
+    solved, unsolved = ([labels.index(label)] for label in (Label.SOLVED, Label.UNSOLVED))
+    parts = [(SeedShard(seed), solved), (SeedShard(other), unsolved)]
+    with pytest.raises(Failure, match=f"{other} is damaged .it has no witness for a level that should have one"):
+        play_seeds(parts, [[0], [1]], ["level/state/position"])
+
+
 def test_grow_refuses_another_name_and_foreign_settings(seed: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="-o data/128k/s"):
         grow(seed, tmp_path / "256k/s", INLINE, QUIET)
@@ -332,6 +344,6 @@ def test_export_refuses_settings_that_no_seed_file_can_have(
     with pytest.raises(UserError, match=r"task.frame_skip is 100, and seed files have at most 64\): export it to"):
         export_seed(skipping, None, out)
     monkeypatch.setattr("levelproof.pipeline.store.seed.source.SAMPLER_VERSION", 99)
-    with pytest.raises(UserError, match="of the sampler made, and this program makes those of version 99: export it"):
+    with pytest.raises(UserError, match="but this levelproof has version 99: export it"):
         export_seed(split, None, out)
     assert not out.exists()

@@ -5,12 +5,12 @@ import io
 import pytest
 from rich.console import Console
 
-from levelproof.pipeline.read import pace
-from levelproof.pipeline.read.pace import ProgressBar
+from levelproof.pipeline.read import progress_bar
+from levelproof.pipeline.read.progress_bar import ProgressBar
 
 
 def test_line_has_no_rate_before_one_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pace, "LINE_EVERY", 0.0)
+    monkeypatch.setattr(progress_bar, "LINE_EVERY", 0.0)
     text = io.StringIO()
     with ProgressBar("levels", 100, Console(file=text)) as bar:
         bar.advance(10)
