@@ -138,7 +138,7 @@ def levels_for(split: Path, config: DistillConfig, network: NetworkConfig, conso
     if config.demonstrations or (config.states and config.teachers.expert):
         experts = experts_of(split, ids[chosen])
     if config.demonstrations:
-        tell(f"{int((experts.expert >= 0).sum()):,} of them have a kept expert")
+        tell(f"{int((experts.expert >= 0).sum()):,} of {len(chosen):,} levels have a kept expert")
     if not experts.config and (config.demonstrations or not config.teachers.searches):
         only = "demonstrations need them" if config.demonstrations else "no other teacher is asked"
         remedy = "demonstrations=0 and states above 0" if config.demonstrations else "teachers.random above 0"
