@@ -36,9 +36,9 @@ class TeachersConfig:
     """How often each teacher tries to reach the goal from a state (0: it is not asked), and noise of demonstrations."""
 
     expert: int = 4  # attempts per state by the level's expert, if the split kept experts; 0: it is not asked
-    witness: int = 16  # attempts per state that vary the level's witness, if the expert fails
-    random: int = 32  # attempts per state by sticky random actions, if the expert fails
-    learner: int = 4  # attempts per state by the learner itself, if the expert fails
+    witness: int = 16  # attempts per state that vary the level's witness, unless the expert reaches the goal
+    random: int = 32  # attempts per state by sticky random actions, unless the expert reaches the goal
+    learner: int = 4  # attempts per state by the learner itself, unless the expert reaches the goal
     sticky: float = 0.5  # share of demonstrations in which the action executed last sometimes replaces the expert's
     perturbed: float = 0.5  # share of demonstrations that start with perturbed velocities, drawn independently
 

@@ -182,10 +182,7 @@ def update_until_done(
             now = now._replace(labels=labels)
             if not now.labels.filled and not config.witnesses:
                 more = "states or teachers.random" if config.states else "demonstrations"
-                raise UserError(
-                    f"No teacher reached the goal: set witnesses above 0, or raise {more}, and choose another folder "
-                    "with -o."
-                )
+                raise UserError(f"No teacher reached the goal: set witnesses above 0, or raise {more}.")
             until = min(update + config.interval, last)
             now, recent = learn(taught, config, network, now, until)
             numbers = {COURSE.step: until, **numbers, **likeness_of(recent)}

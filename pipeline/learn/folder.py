@@ -20,6 +20,7 @@ from levelproof.configs.convert import plain
 from levelproof.experts.networks.saved import CONFIG, WEIGHTS, Policy, named, policy_folder, save_policy, unnamed
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs.progress import say
+from levelproof.pipeline.learn.metrics import METRICS
 from levelproof.pipeline.read.progress_bar import LINE_EVERY
 from levelproof.pipeline.store.disk import NotRegular, explaining_writes, read_regular
 from levelproof.pipeline.store.files import write
@@ -49,10 +50,10 @@ def writing_run(out: Path) -> Iterator[Callable[[], None]]:
         UserError: `out` cannot be the folder of a policy, or another command is writing to it.
         Failure: a write fails.
     """
-    with explaining_writes(out, "the last checkpoint stays"), only_trainer(made(out)) as require_ours:
-        for name in (CHECKPOINT, RUN):
-            for unfinished in out.glob(f".{name}.[0-9]*"):  # of a killed command
-                unfinished.unlink(missing_ok=True)
+    with explaining_writes(out, "what was saved stays"), only_trainer(made(out)) as require_ours:
+        patterns = *(f".{name}.[0-9]*" for name in (CHECKPOINT, RUN, METRICS)), f"{WEIGHTS}.tmp", f"{CONFIG}.tmp"
+        for unfinished in (path for pattern in patterns for path in out.glob(pattern)):  # of a killed command
+            unfinished.unlink(missing_ok=True)
         yield require_ours
 
 
@@ -79,7 +80,7 @@ def require_same_run(out: Path, note: dict[str, Any], free: Sequence[str] = ()) 
 def with_stack(out: Path, note: dict[str, Any], tell: Callable[[str], None]) -> dict[str, Any]:
     """Return the note with the versions and devices that have trained the run in `out`, this machine's last.
 
-    Tells the user if the last ones before were others: the same command then need not give the same bytes.
+    Tells the user if other versions or another device trained it last: its bytes may then differ.
 
     Raises:
         Failure: the note is damaged.
@@ -109,13 +110,13 @@ def note_in(out: Path) -> dict[str, Any] | None:
     Raises:
         Failure: the note is damaged.
     """
-    if not (out / CHECKPOINT).exists() and not (out / CONFIG).exists():
-        return None  # stopped before its first checkpoint: other settings may begin anew
     try:
         note = json.loads(read_regular(out / RUN))
         if not isinstance(note, dict) or type(note.get("cores", 1)) is not int:
             raise ValueError("it does not describe a run")
-        return note
+        saved = (out / CHECKPOINT).exists() or (out / CONFIG).exists()
+        # A run that was stopped before its first checkpoint gives way to one of other settings
+        return note if saved or MADE_BY not in note else None
     except (FileNotFoundError, NotADirectoryError):  # `made` refuses a file
         return None
     except (OSError, ValueError, RecursionError) as error:
@@ -123,7 +124,7 @@ def note_in(out: Path) -> dict[str, Any] | None:
 
 
 def write_note(out: Path, note: dict[str, Any]) -> None:
-    write(out / RUN, (json.dumps(note, indent=2) + "\n").encode())
+    write(out / RUN, (json.dumps(note, indent=2) + "\n").encode(), durable=True)
 
 
 def continued(out: Path, fresh: T) -> T:

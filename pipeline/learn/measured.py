@@ -128,7 +128,7 @@ def midway_levels(data: Dataset, count: int | None, start: float) -> MeasuredLev
     steps = data.manifest["steps_to_goal"]
     witnessed = np.flatnonzero(steps.is_valid().to_numpy())[:count]
     if not len(witnessed):
-        raise UserError(f"No level of {data.split} that meets the condition has a witness: choose another condition.")
+        raise UserError(f"No level of {data.split} that meets the condition has a witness: choose others.")
     at = (steps.take(pa.array(witnessed)).to_numpy() * start).astype(np.int64)
     parts = [data.state(witnessed[i : i + AT_ONCE], at[i : i + AT_ONCE]).level for i in range(0, len(at), AT_ONCE)]
     levels = jax.tree.map(lambda *xs: np.moveaxis(np.concatenate(xs), 0, -1), *parts)

@@ -101,8 +101,8 @@ def handmade_folder(say: Callable[[str], None] = print) -> Path:
         if _is_whole(folder):  # another process was faster
             return folder
         raise Failure(
-            f"Cannot write the handmade levels to {folder} ({error.strerror}): make room there, or set "
-            "LEVELPROOF_CACHE_DIR to another folder."
+            f"Cannot write the handmade levels to {folder} ({error.strerror or error}): set LEVELPROOF_CACHE_DIR to a "
+            "folder with room that you may write to."
         ) from None
     return folder
 

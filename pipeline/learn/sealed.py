@@ -74,14 +74,14 @@ def without_sealed(
     sealed = sealed_hashes(size)
     usable = np.array([content_hash not in sealed for content_hash in hashes])
     if copies := int((~usable).sum()):
-        tell(f"Left out {many(copies, 'level')} of {place}: copies of sealed levels, which only measure policies.")
+        tell(f"Left out {many(copies, 'level')} of {place}: copies of sealed levels, kept to measure policies.")
     return usable
 
 
 def require_some_usable(place: Path, usable: Bool[np.ndarray, " level"]) -> None:
     """Raise UserError if all levels are copies of sealed ones."""
     if not usable.any():
-        raise UserError(f"{place} has only copies of sealed levels, which only measure policies: choose others.")
+        raise UserError(f"{place} has only copies of sealed levels, kept to measure policies: choose others.")
 
 
 def _kept(name: str) -> list[str]:

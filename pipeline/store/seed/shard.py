@@ -11,8 +11,7 @@ import pyarrow as pa
 from jaxtyping import Bool, Int
 
 from levelproof.experts.witness.episode import play_episodes, repeated_rows
-from levelproof.levelgen.batching import take
-from levelproof.levelgen.level import Level, concatenate_levels, name_of
+from levelproof.levelgen.level import Level, name_of
 from levelproof.levelgen.task.observe.kinds import ObservationType
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.density import Restored
@@ -131,24 +130,16 @@ def stored_levels(source: Path, level_ids: np.ndarray) -> Level:
     Raises:
         Failure: a file is damaged or missing.
     """
-    parts, found = [], []
+    contents: dict[int, bytes | None] = {}
+    config = None
     for path in seed_files(source):
         about, rows = read_seed(path, ["content"], np.sort(level_ids))
-        rows = rows.filter(pa.array(np.isin(rows.column("level_id").to_numpy(), level_ids)))
-        if not rows.num_rows:
-            continue
-        ids = rows.column("level_id").to_numpy()
-        try:
-            levels = LevelSource.of(about.fragment.config, path).levels(ids, rows.column("content").to_pylist())
-        except ValueError as error:
-            raise damaged_seed(path, error) from error
-        parts.append(levels)
-        found += ids.tolist()
-    row_of = {level_id: row for row, level_id in enumerate(found)}
-    if missing := set(level_ids.tolist()) - row_of.keys():
-        raise damaged_seed(source, ValueError(f"level {min(missing)} is missing"))
-    rows = np.array([row_of[level_id] for level_id in level_ids.tolist()])
-    return take(concatenate_levels(parts), rows)
+        config = about.fragment.config
+        contents |= dict(zip(rows.column("level_id").to_pylist(), rows.column("content").to_pylist(), strict=True))
+    try:
+        return LevelSource.of(config or {}, source).levels(level_ids, [contents.get(i) for i in level_ids.tolist()])
+    except ValueError as error:
+        raise damaged_seed(source, error) from error
 
 
 def play_seeds(

@@ -1,6 +1,8 @@
 """The command that measures policies, on the shared split, level files and sealed levels."""
 
+import errno
 import json
+import os
 import re
 import shutil
 import sys
@@ -403,6 +405,17 @@ def test_missing_levels_of_the_reference_are_explained(
     assert_refused(here([*words, "reference-random"], tmp_path), 2, "python -m benchmarks.published")
     published.random_file("s").write_bytes(b"damaged")
     assert_refused(here([*words, "reference-random"], tmp_path), 1, "delete it and write it again")
+
+
+def test_levels_of_the_reference_need_a_folder_that_can_be_written(
+    published_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(published, "scratch", full)
+    done = here(["evaluate", "--size", "s", "--on", "handmade"], tmp_path)
+    assert_refused(done, 1, "Cannot write the handmade levels to", "No space left", "set LEVELPROOF_CACHE_DIR")
 
 
 @pytest.mark.campaign

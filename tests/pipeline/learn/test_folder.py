@@ -12,6 +12,7 @@ import pytest
 from rich.console import Console
 
 import levelproof
+from levelproof.experts.networks.saved import WEIGHTS
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.learn.folder import (
     CHECKPOINT,
@@ -26,6 +27,7 @@ from levelproof.pipeline.learn.folder import (
     write_note,
     writing_run,
 )
+from levelproof.pipeline.learn.metrics import METRICS
 from levelproof.pipeline.store.layout import WRITER_LOCK
 
 STATE = {"step": np.int32(3)}
@@ -75,7 +77,7 @@ def test_a_file_gets_kept_lines_and_one_every_half_minute(monkeypatch: pytest.Mo
 
 
 def test_run_that_saved_nothing_gives_way_to_other_settings(tmp_path: Path) -> None:
-    write_note(tmp_path, {"settings": {"seed": 0}})
+    write_note(tmp_path, with_stack(tmp_path, {"settings": {"seed": 0}}, print))
     require_same_run(tmp_path, {"settings": {"seed": 1}})
     (tmp_path / CHECKPOINT).touch()
     with pytest.raises(UserError, match="seed was 0, now 1"):
@@ -85,7 +87,7 @@ def test_run_that_saved_nothing_gives_way_to_other_settings(tmp_path: Path) -> N
 def test_what_a_killed_command_left_is_removed(tmp_path: Path) -> None:
     out = tmp_path / "policy"
     out.mkdir()
-    for name in (f".{CHECKPOINT}.123", f".{RUN}.123", "mine.123"):
+    for name in (f".{CHECKPOINT}.123", f".{RUN}.123", f".{METRICS}.123", f"{WEIGHTS}.tmp", "mine.123"):
         (out / name).touch()
     with writing_run(out) as require_ours:
         require_ours()

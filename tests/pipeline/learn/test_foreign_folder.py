@@ -52,8 +52,8 @@ def test_metrics_log_into_no_folder_elsewhere(out: Path, tmp_path: Path) -> None
 def test_clone_refuses_irregular_files(out: Path, profile: Path, kind: str) -> None:
     reads: dict[str, Any] = {
         METRICS: lambda: Metrics(out, COURSE, "none", {}, 0, print, list),
-        run_folder.CHECKPOINT: lambda: run_folder.continued(out, jnp.zeros(3)),
         run_folder.RUN: lambda: run_folder.require_same_run(out, {}),
+        run_folder.CHECKPOINT: lambda: run_folder.continued(out, jnp.zeros(3)),
     }
     for name, read in reads.items():
         PLANTED[kind](out / name, profile)

@@ -18,7 +18,7 @@ from levelproof.levelgen.task.lanes import FIRST_EXTRA
 from levelproof.pipeline.exchange.level_json import export
 from levelproof.pipeline.learn import sealed
 from levelproof.pipeline.learn import train as module
-from levelproof.pipeline.learn.folder import CHECKPOINT, weights_digest
+from levelproof.pipeline.learn.folder import weights_digest
 from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.trained_on import levels_for
 from tests.pipeline.command import assert_refused, here
@@ -293,7 +293,6 @@ def test_replay_of_too_few_levels_is_refused(split: Path, tmp_path: Path) -> Non
 @pytest.mark.parametrize("note", [{"splits": [], "settings": {"where": ""}}, {"settings": {"ppo": 1}}, {"cores": 7}])
 def test_folder_with_the_note_of_another_command_is_refused(note: Any, tmp_path: Path) -> None:
     (tmp_path / "agent").mkdir()
-    (tmp_path / "agent" / CHECKPOINT).touch()
     (tmp_path / "agent" / "run.json").write_text(json.dumps(note))
     assert_refused(here(["train", *LANES, *TINY], tmp_path), 2, "has a run with other settings or levels")
 
