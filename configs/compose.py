@@ -254,10 +254,9 @@ def compose_train(overrides: Sequence[str]) -> "TrainConfig":
             raise ConfigError(f"{name} has no effect without ppo.kl_weight: leave it out.")
     _require_no_network(config.start, parsed)
     _require_heads(config.network.kind, parsed)
-    if random and config.distribution not in distributions():
-        hint = suggestion(config.distribution, distributions())
-        names = ", ".join(distributions())
-        raise ConfigError(f"there is no distribution {config.distribution}{hint}: choose one of {names}.")
+    if random and config.distribution not in (known := distributions()):
+        hint = suggestion(config.distribution, known)
+        raise ConfigError(f"there is no distribution {config.distribution}{hint}: choose one of {', '.join(known)}.")
     return config
 
 

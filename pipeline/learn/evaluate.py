@@ -197,7 +197,10 @@ def _log(one: _Contestant, looked_at: Sequence[dict[str, Any]], attempts: int, s
 
 
 def _own_experts(group: MeasuredLevels, on: str, splits: Sequence[Path], attempts: int) -> list[Specialists]:
-    """Return the rated attempts of the levels' own experts; the second with a budget names its split."""
+    """Return the rated attempts of the levels' own experts.
+
+    If two splits have the same budget, the name of the second includes its split.
+    """
     own = sealed_specialists(name_of(group.levels.size), len(group.level_ids), attempts) if on == SEALED else []
     for split in splits:
         one = specialists_of(split, group.level_ids, attempts)
