@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Int
 from rich.console import Console
 
 from levelproof.configs.distill import DistillConfig
-from levelproof.experts.generalist.teachers import no_experts
+from levelproof.experts.generalist.teachers import KnownExperts, no_experts
 from levelproof.experts.imitation import Imitation, Likeness, Transitions, begin_imitation, imitate
 from levelproof.experts.labels import Label
 from levelproof.experts.networks.over_levels import NetworkConfig
@@ -61,6 +62,15 @@ COURSE = Curves(
 WITHOUT_EFFECT = ("log",)  # settings that a continued run may change
 
 
+class ChosenLevels(NamedTuple):
+    """Levels of a split to learn from, before their witnesses are read."""
+
+    data: Dataset
+    chosen: Int[np.ndarray, " level"]  # their indices in `data`
+    facts: dict[str, Any]  # what identifies them, as JSON
+    experts: KnownExperts
+
+
 class Distillation(NamedTuple):
     """Training under way, with all that decides how it continues."""
 
@@ -80,13 +90,14 @@ def distill(split: Path, config: DistillConfig, out: Path, console: Console) -> 
     tell = lambda text: say(console, text)
     start = policy_at(Path(config.start)) if config.start else None
     network = start.network if start else config.network
-    taught = levels_for(split, config, network, console)
-    size = taught.levels.size
+    chosen = levels_for(split, config, tell)
+    size = chosen.data.size
     if start:
         require_size(start, size, str(split), "start from one that plays any size")
-    note = note_of(taught, config)
+    note = note_of(chosen, config)
     with writing_run(out) as require_ours:
         require_same_run(out, note)
+        taught = witnessed(split, chosen, network, console)
         params = start.params if start else None
         columns = taught.witnesses.motion.shape[1]
         fresh = Distillation(
@@ -109,14 +120,13 @@ def distill(split: Path, config: DistillConfig, out: Path, console: Console) -> 
     tell_done(out, tell)
 
 
-def levels_for(split: Path, config: DistillConfig, network: NetworkConfig, console: Console) -> TaughtLevels:
-    """Read the levels of a split that have a witness and are not trivial; leave out copies of sealed levels.
+def levels_for(split: Path, config: DistillConfig, tell: Callable[[str], None]) -> ChosenLevels:
+    """Choose among the levels of a split with a witness; leave out trivial ones and copies of sealed levels.
 
     Raises:
         UserError: the split is unusable, has sealed ids, or no usable level.
         Failure: its data is damaged.
     """
-    tell = lambda text: say(console, text)
     data = Dataset(split, config.where or None, (), 0.0)
     ids = data.manifest["level_id"].to_numpy()
     require_not_sealed(split, ids)
@@ -146,15 +156,26 @@ def levels_for(split: Path, config: DistillConfig, network: NetworkConfig, conso
             f"{split} has no kept experts of these levels, and {only}: set {remedy}, or make a split in a folder of "
             "this machine with keep_experts=true."
         )
+    return ChosenLevels(data, chosen, facts, experts)
+
+
+def witnessed(split: Path, levels: ChosenLevels, network: NetworkConfig, console: Console) -> TaughtLevels:
+    """Read levels with their witnesses, in the form in which the network sees them.
+
+    Raises:
+        Failure: their data is damaged.
+    """
+    data, chosen = levels.data, levels.chosen
     with ProgressBar("levels read", len(chosen), console) as bar:
         witnesses = read_pool(data, chosen, network, follow=bar.advance)
-    return TaughtLevels(split, facts, ids[chosen], data.levels(chosen), witnesses, experts, data.rules)
+    ids = data.manifest["level_id"].to_numpy()[chosen]
+    return TaughtLevels(split, ids, data.levels(chosen), witnesses, levels.experts, data.rules)
 
 
-def note_of(taught: TaughtLevels, config: DistillConfig) -> dict[str, Any]:
+def note_of(levels: ChosenLevels, config: DistillConfig) -> dict[str, Any]:
     """Return what decides a run's result, as JSON."""
     settings = settings_without(config, WITHOUT_EFFECT)
-    return {"splits": [taught.facts], "settings": settings, "start": weights_digest(config.start)}
+    return {"splits": [levels.facts], "settings": settings, "start": weights_digest(config.start)}
 
 
 def update_until_done(

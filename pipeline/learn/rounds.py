@@ -32,7 +32,6 @@ class TaughtLevels(NamedTuple):
     """The levels of a run, with what teachers know of them."""
 
     split: Path
-    facts: dict[str, Any]  # what identifies them, as JSON
     level_ids: Int[np.ndarray, " level"]
     levels: Level  # with first states; on the host, level axis last
     witnesses: LevelPool

@@ -246,7 +246,8 @@ class _With:
 
 def test_levels_are_witnessed_and_neither_trivial_nor_sealed(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config, quiet = DistillConfig(), Console(quiet=True)
-    taught = module.levels_for(split, config, NetworkConfig(), quiet)
+    chosen = module.levels_for(split, config, print)
+    taught = module.witnessed(split, chosen, NetworkConfig(), quiet)
     data = levelproof.open(split, where="label = 'solved'")
     ids = data.manifest["level_id"].to_numpy()
     assert np.array_equal(taught.level_ids, ids)
@@ -256,15 +257,16 @@ def test_levels_are_witnessed_and_neither_trivial_nor_sealed(split: Path, monkey
         first = int(np.argmax(stored.done[i])) + 1
         assert np.array_equal(witness[:first, :, i], stored.action[i, :first])
         assert (witness[first:, :, i] == stored.action[i, first - 1]).all()
-    few = module.levels_for(split, DistillConfig(pool=3), NetworkConfig(), quiet)
+    some = module.levels_for(split, DistillConfig(pool=3), print)
+    few = module.witnessed(split, some, NetworkConfig(), quiet)
     assert len(few.level_ids) == len(few.levels) == len(few.witnesses.steps) == 3
     monkeypatch.setattr(module, "Label", type("Trivial", (), {"TRIVIAL": Label.SOLVED}))
     with pytest.raises(levelproof.UserError, match="only trivial levels"):
-        module.levels_for(split, config, NetworkConfig(), quiet)
+        module.levels_for(split, config, print)
     monkeypatch.undo()
     monkeypatch.setattr(sealed, "SEALED", range(int(ids[0]), int(ids[0]) + 1))
     with pytest.raises(levelproof.UserError, match="sealed to measure policies"):
-        module.levels_for(split, config, NetworkConfig(), quiet)
+        module.levels_for(split, config, print)
 
 
 @pytest.mark.parametrize(
@@ -300,8 +302,11 @@ def test_bad_input_is_refused_in_one_sentence(words: list[str], sentence: str, s
 
 
 @pytest.mark.slow
-def test_folder_of_another_run_is_refused(policy: Path, split: Path, tmp_path: Path) -> None:
+def test_folder_of_another_run_is_refused_before_levels_are_read(
+    policy: Path, split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     shutil.copytree(policy, tmp_path / "policy")
+    monkeypatch.delattr(module, "read_pool")
     done = here(["distill", str(split), "-o", "policy", *ROUNDS, *TEACHERS, *TINY, "seed=1"], tmp_path)
     assert_refused(done, 2, "has a run with other settings or levels")
 
