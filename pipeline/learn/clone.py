@@ -154,8 +154,9 @@ def train(
     feed = Feed(sources, config)
     with ProgressBar("levels read", feed.levels, console) as bar:
         batches = feed.batches(first, feed.read(first, bar.advance))
-    with shown(console, "compiling", last, first) as show:
+    with shown(console, "reading validation levels", last, first) as show:
         held = {str(source.data.split): held_of(source, config) for source in sources}
+        show(0, "compiling")
         for update, batch in enumerate(batches, first + 1):
             state, likeness = imitate(state, batch, config.network, config.train)
             recent.append(likeness)
