@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> Report:
         "`sfl-1m-envs`. The reference wrote the levels; ours are played in our engine. Unsolvable levels count, too. "
         "Brackets: 95% intervals over levels; the published rates have none.",
         "Env steps are those that reinforcement learned from: not those in which learnability measured levels, nor "
-        "those of searches for demonstrations. The READMEs of `builtin:s` and `builtin:m` say how many these were.",
+        "those of searches for demonstrations. `builtin:s` and `builtin:m` have neither.",
         *(
             f"`{policy}` also learned from demonstrations, whose env steps are not counted: witnesses of {count:,} "
             "levels."

@@ -127,11 +127,10 @@ def run(args: argparse.Namespace) -> Report:
             by_cost(results),
         ],
         [
-            f"Every policy has {args.core_seconds:,.0f} core-seconds of one core, with compiling (some ways had fewer "
-            "so far, as the table says), for all that it is "
-            f"made from: the search of {args.levels} levels (`procedure=label`, ids from {FIRST:,} on, for the "
+            f"Every policy has at most {args.core_seconds:,.0f} core-seconds of one core, with compiling, for all "
+            f"that it is made from: the search of {args.levels} levels (`procedure=label budget=16k`, ids from {FIRST:,} on, for the "
             f"second seed from {FIRST + BETWEEN_SEEDS:,}), the clone "
-            f"({', '.join((f'{args.updates:,} updates', *(f'`{each}`' for each in args.cloning)))}), and "
+            f"({', '.join((f'{args.updates:,} updates', *(f'`{each}`' for each in (*SCRATCH, *args.cloning))))}), and "
             "reinforcement learning for the rest, on random levels unless a way says otherwise"
             f"{f'; what {START} took is not counted' if any(WAYS[way].start == START for way in shown) else ''}. "
             "Compare rows of one processor: another takes more or fewer env steps in as many "
@@ -229,7 +228,7 @@ def cloned(args: argparse.Namespace, way: str, seed: int) -> tuple[Path, float]:
     updates = args.updates // 2 if WAYS[way].teachers else args.updates
     policy, split = args.folder / f"clone-{args.size}-{args.levels}-{updates}-{seed}", split_of(args, seed)
     spent, words = searched(args, seed), (f"train.updates={updates}", f"seed={seed}")
-    command("clone", split, "-o", policy, "network.width=64", *words, *args.cloning)
+    command("clone", split, "-o", policy, *SCRATCH, *words, *args.cloning)
     spent += lines_of(policy)[-1]["bc/core_seconds"]
     if WAYS[way].teachers:
         start, policy = policy, policy.with_name(f"distilled-{args.size}-{args.levels}-{updates}-{seed}")

@@ -91,19 +91,19 @@ def run(args: argparse.Namespace) -> Report:
             Table(FALLS, falls(job, listing.levels, args.size), "Levels in which green can only fall onto red"),
         ],
         notes=[
-            "Each level is labelled alone, on one core, by the default procedure, with up to "
-            f"`search.env_steps={args.search}`, half as much patience and a quarter as many variations; seconds "
-            "exclude compiling. The slots beside its expert are empty, so a job that labels many levels takes fewer "
-            "seconds for each. The columns after the seconds are env steps.",
+            "Each level is labelled alone, on one core, by the default procedure with "
+            f"`{' '.join((f'budget={args.budget}', *settings))}`; seconds exclude compiling. "
+            "The slots beside its expert are empty, so a job that labels many levels takes fewer seconds for each. The "
+            "columns after the seconds are env steps.",
             f"*PPO*: the reference's hyperparameters for {PPO.expert.updates_in(PPO_BUDGET):,} updates of "
             f"{PPO.expert.steps_per_update:,} env steps, on our engine: the variant `reference` of "
             "[solved.md](solved.md), which also has it in the reference's own environment, where this would take some "
             "eight core-hours. It solves a level if its last evaluation has a witness; *first success*: env "
             "steps of training until then.",
             "In the levels of the last table no actions reach the goal: green is a circle that its thrusters cannot "
-            "turn, they lift less than it weighs, and all that it can cover before it lies on the red floor meets only "
-            "red (`benchmarks/falls.py`). In `h12_platformer_1` and `h13_platformer_2` the thrusters lift "
-            "half of the weight, too, and what green can reach before red is one side of a shelf, below its edge. In "
+            "turn, they lift less than it weighs, and everything it can touch before it lands on the red floor is "
+            "red (`benchmarks/falls.py`). In `h12_platformer_1` and `h13_platformer_2` the thrusters also "
+            "lift half of green's weight, and before red green reaches only one side of a shelf, below its edge. In "
             "`hard_beam_balance`, `hard_cartpole_thrust` and `hard_cartpole_wheels` blue is more than a metre above "
             "what can reach it ([tried](../tried/labels.md)).",
             f"![The solved levels when their witnesses reach the goal]({PLOT})",

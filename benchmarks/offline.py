@@ -62,9 +62,9 @@ def run(args: argparse.Namespace) -> Report:
             f"All policies learn from the first episodes of `{args.where}` in {args.split.name}, and take "
             f"{args.updates:,} updates of 1,024 steps. `docs/learners/offline_torchrl.py` trains those of TorchRL on "
             "the Minari dataset of these levels: two layers of 256 on the symbolic observation, one output for each of "
-            "324 combined actions. Q-learning takes its best action, the others draw theirs. *Flat network*: an MLP "
-            "of the same width and depth with an output for each choice of each entry; the last rows are the "
-            "default's, an attention network over entities.",
+            "324 combined actions. Conservative Q-learning takes its best action, the others draw theirs. *Flat "
+            "network*: an MLP of the same width and depth with an output for each choice of each entry; *levelproof "
+            "clone*: the default, attention over entities.",
             "Core-seconds are CPU time of training, with reading and compiling.",
         ],
     )

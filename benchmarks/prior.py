@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> Report:
             "The policy's steps are those of its shortest attempt that reaches the goal, on levels that both solve.",
             f"So the attempts cost {', '.join(f'{ratio:.0f}' for ratio in ratios)} times what they could save "
             f"({', '.join(one['size'] for one in results)}), and find {total('found_of_unsolved')} of "
-            f"{total('unsolved'):,} unsolved levels. That is why there is no setting for a policy that plays before "
+            f"{total('unsolved'):,} unsolved levels. So no setting lets a policy play before "
             "the search ([more](../tried/learners.md#a-policy-before-the-search)).",
         ],
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from levelproof.levelgen.task.rules import MAX_REWARD_SCALE, TaskParams
 from levelproof.physics.bounds import require
 
-CHUNK = 256  # lanes that go through the network together: their activations fit a core's cache
+CHUNK = 256  # samples of a minibatch come in chunks of so many lanes of one time step
 
 MAX_REPEAT = 256  # env steps; an episode of the default rules is then one action
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from levelproof.experts.generalist.actor_critic import ActorCriticParams, logits_and_value
+from levelproof.experts.networks.chunks import chunk_by_chunk, lanes_at_once
 from levelproof.experts.networks.over_levels import NetworkConfig, seen
 from levelproof.experts.policy import log_probability, sample
 from levelproof.levelgen.level import ACTIONS, Level
@@ -104,12 +106,13 @@ def rollout(
     size = table.size
     lanes = lanes_of(size, rules)
     count = playing.gained.shape[-1]
+    at_once = lanes_at_once(size, count)
 
     def act(now: Playing, t: Array) -> tuple[Playing, tuple[Experience, Ended]]:
         of_action, of_level = jax.random.split(jax.random.fold_in(key, t))
         world = now.state.now.state
         observation = seen(network, replace(now.played.level, state=world), world)
-        logits, value = logits_and_value(params, network, size, observation)
+        logits, value = chunk_by_chunk(partial(logits_and_value, params, network, size), observation, at_once)
         live = action_mask(now.played.level)
         action = jnp.where(live, sample(logits, jax.random.uniform(of_action, (ACTIONS, count))), 0)
         log_before = log_probability(logits, action, live)

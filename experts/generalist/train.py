@@ -22,6 +22,7 @@ from levelproof.experts.generalist.config import CHUNK, PPOConfig
 from levelproof.experts.generalist.curricula import Curriculum, EndedEpisodes
 from levelproof.experts.generalist.rollout import Ended, Experience, Playing, begin, rollout
 from levelproof.experts.generalist.subsample import LEAST, choose
+from levelproof.experts.networks.chunks import lanes_at_once
 from levelproof.experts.networks.layers import LOGITS
 from levelproof.experts.networks.over_levels import NetworkConfig, logits_and_summary
 from levelproof.experts.objective import advantages, normalised_over, terms
@@ -210,7 +211,7 @@ def _samples(ppo: PPOConfig, experience: Experience, key: Key[Array, ""]) -> Chu
     if ppo.subsample == 1:
         return samples
     lane, weight = choose(gain, counts, ppo.samples(jax.lax.axis_size(CORES)), key)
-    take = jax.vmap(partial(jnp.take, axis=-1))
+    take = jax.vmap(partial(jnp.take, axis=-1, mode="clip"))
     return jax.tree.map(lambda x: take(x, lane), samples)._replace(weight=weight / share)
 
 
@@ -220,7 +221,7 @@ def _chunks(
     """Return a core's samples as chunks, chunk axis first."""
     samples = _samples(recipe.ppo, experience, key)
     count = samples.value.shape[-1]
-    width = min(count, CHUNK)
+    width = lanes_at_once(recipe.size, min(count, CHUNK))
 
     def cut(x: Array) -> Array:  # [time, ..., sample] to [chunk, ..., sample]
         parted = jnp.moveaxis(x.reshape(*x.shape[:-1], count // width, width), -2, 1)

@@ -78,17 +78,32 @@ def _relative(level: Level, entities: Placed) -> Float[Array, "entity column lan
     """Return the columns that say where the nearest active body of each goal role is, seen from each entity."""
     cos, sin = jnp.cos(entities.angle), jnp.sin(entities.angle)
     columns = [cos, sin, *_in_frame(entities.velocity, cos, sin)]
-    offset = level.state.position[None] - entities.position[:, None]  # [entity, body, 2, lane]
-    squared = jnp.square(offset).sum(2)
     for role in GOALS:
         candidate = (level.role == role) & level.model.active
-        nearest = _one_hot(jnp.where(candidate, squared, FAR).argmin(1), len(candidate)) * candidate.any(0)
-        to, moves = (nearest[:, :, None] * offset).sum(1), jnp.einsum("tbl,bcl->tcl", nearest, level.state.velocity)
+        to, moves = _nearest(level.state, candidate, entities.position)
         relative = (moves - entities.velocity) * candidate.any(0)
         distance = jnp.sqrt(jnp.square(to).sum(1))
         columns += [candidate.any(0) & jnp.ones_like(distance, bool), distance, to[:, 0], to[:, 1]]
         columns += [*_in_frame(to, cos, sin), *_in_frame(relative, cos, sin)]
     return _stacked(columns)
+
+
+def _nearest(state: State, candidate: Bool[Array, "body lane"], at: Array) -> tuple[Array, Array]:
+    """Return where the nearest candidate is, seen from each point, and its velocity; zeros if there is none.
+
+    Body after body, because XLA's argmin over all bodies is slow on CPUs.
+    """
+
+    def closer(body: Array, found: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        offset = state.position[body] - at
+        distance = jnp.where(candidate[body], jnp.square(offset).sum(1), jnp.inf)
+        takes = distance < found[0]
+        select = lambda new, old: jnp.where(takes[:, None], new, old)
+        return jnp.minimum(distance, found[0]), select(offset, found[1]), select(state.velocity[body], found[2])
+
+    nothing = jnp.full((len(at), at.shape[-1]), jnp.inf), jnp.zeros_like(at), jnp.zeros_like(at)
+    _, to, moves = jax.lax.fori_loop(0, len(candidate), closer, nothing)
+    return to, moves
 
 
 def _in_frame(xy: Float[Array, "entity 2 lane"], cos: Array, sin: Array) -> list[Array]:
@@ -119,7 +134,7 @@ def _at(bodies: Placed, index: np.ndarray) -> Placed:
 
 
 def _rows_of(at: Float[Array, "entity body lane"], rows: Float[Array, "body row lane"]) -> Array:
-    return jnp.einsum("tbl,brl->trl", at, rows)
+    return sum(at[:, b, None] * rows[b] for b in range(len(rows)))  # einsum would multiply a tiny matrix in each lane
 
 
 def _one_hot(index: Array, count: int) -> Float[Array, "entity count lane"]:

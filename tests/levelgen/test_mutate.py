@@ -10,7 +10,7 @@ import pytest
 from levelproof.levelgen.edit import EditError, set_role
 from levelproof.levelgen.files.level_file import LevelFile, from_document, to_document
 from levelproof.levelgen.level import SIZES, Level, Role
-from levelproof.levelgen.mutate import DRAWS, child_of, children_of, playable
+from levelproof.levelgen.mutate import DRAWS, MAX_SPEED, child_of, children_of, playable
 from levelproof.levelgen.proofs import stay_idle
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
@@ -67,6 +67,16 @@ def test_levels_without_a_goal_or_with_overlaps_are_not_playable() -> None:
     assert np.asarray(playable(level, DEFAULT_RULES)).all()
     body = int(np.flatnonzero(np.asarray(level.role)[:, 0] == Role.GREEN)[0])
     assert not np.asarray(playable(set_role(level, body, Role.PLAIN), DEFAULT_RULES)).any()
+    position, velocity = (np.asarray(x).copy() for x in (level.state.position, level.state.velocity))
+    position[body, 0], velocity[body, 0] = -0.1, 2 * MAX_SPEED
+    unpowered = {name: 0 * getattr(level.model, name) for name in ("motor_power", "thruster_power")}
+    for spoiled in (
+        replace(level, role=np.where(np.asarray(level.role) == Role.BLUE, Role.PLAIN, level.role)),
+        replace(level, model=replace(level.model, **unpowered)),
+        replace(level, state=replace(level.state, position=position)),
+        replace(level, state=replace(level.state, velocity=velocity)),
+    ):
+        assert not np.asarray(playable(spoiled, DEFAULT_RULES)).any()
     levels = sample_levels(np.arange(64), "s")
     onto_each_other = np.asarray(levels.state.position).copy()
     onto_each_other[4:] = onto_each_other[4:5] + 0.01 * np.arange(len(onto_each_other) - 4)[:, None, None]

@@ -9,7 +9,8 @@ import pytest
 
 from levelproof.experts.config import RECORD_STEPS, ExpertConfig
 from levelproof.experts.evaluation import Moment
-from levelproof.experts.generalist.attempts import play_expert, recalled
+from levelproof.experts.generalist import teachers
+from levelproof.experts.generalist.attempts import Found, play_expert, recalled
 from levelproof.experts.generalist.teachers import (
     Asked,
     KnownExperts,
@@ -18,6 +19,7 @@ from levelproof.experts.generalist.teachers import (
     TeachersConfig,
     label_states,
     no_experts,
+    replay_from,
 )
 from levelproof.experts.generalist.visited import draw_states, visit
 from levelproof.experts.imitation import from_motion
@@ -79,6 +81,39 @@ def test_labels_reach_the_goal_from_the_state_and_not_before(asked: Asked, label
         assert not (np.asarray(result.done) & open_ & ~ends).any()
         open_ &= ~ends
     assert not open_.any()
+
+
+def test_success_of_another_length_is_no_label(asked: Asked, labels: Labels) -> None:
+    reached = labels.length > 0
+    for longer in (-1, 0, 1):
+        length = np.where(reached, labels.length + longer, 0).astype(np.int32)
+        right, _ = replay_from(asked.level, asked.now, Found(labels.action, length), False, DEFAULT_RULES)
+        np.testing.assert_array_equal(right, reached if not longer else np.zeros(COUNT, bool))
+
+
+def test_shortest_success_of_several_teachers_is_the_label(asked: Asked, labels: Labels) -> None:
+    alone = {
+        Teacher.WITNESS: labelled(asked, replace(SEARCH, random=0)).length,
+        Teacher.RANDOM: labelled(asked, replace(SEARCH, witness=0)).length,
+    }
+    lengths = np.where(np.array([*alone.values()]) > 0, np.array([*alone.values()]), RECORD_STEPS + 1)
+    shortest = lengths.min(0)
+    np.testing.assert_array_equal(labels.length, np.where(shortest <= RECORD_STEPS, shortest, 0))
+    first = np.array([*alone])[lengths.argmin(0)]
+    np.testing.assert_array_equal(labels.teacher, np.where(labels.length, first, Teacher.NONE))
+
+
+def test_states_are_labelled_the_same_in_small_blocks(asked: Asked, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = replace(SEARCH, random=0)
+    together = labelled(asked, config)
+    monkeypatch.setattr(teachers, "AT_ONCE", 5)
+    apart = labelled(asked, config)
+    assert apart.env_steps == together.env_steps
+    np.testing.assert_array_equal(apart.teacher, together.teacher)
+    np.testing.assert_array_equal(apart.length, together.length)
+    for i, length in enumerate(together.length):  # what follows the goal is not read
+        np.testing.assert_array_equal(apart.action[:length, :, i], together.action[:length, :, i])
+        np.testing.assert_array_equal(apart.motion[:length, i], together.motion[:length, i])
 
 
 def test_labels_use_no_more_env_steps_than_the_episode_has_left(asked: Asked, labels: Labels) -> None:

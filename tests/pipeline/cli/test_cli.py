@@ -16,7 +16,7 @@ from levelproof.pipeline.cli import main
 from levelproof.pipeline.jobs.inline import Handle
 from levelproof.pipeline.store import seal
 from levelproof.pipeline.store.event_files import events_of, runs_in
-from levelproof.pipeline.store.layout import data_paths
+from levelproof.pipeline.store.layout import data_paths, made_within
 from levelproof.pipeline.store.locks import only_writer
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from tests.pipeline.command import ROOT, TINY, assert_refused, here, run
@@ -170,11 +170,15 @@ def test_later_command_keeps_earlier_levels_wanted(split: Path) -> None:
     settings = [setting for setting in TINY if not setting.startswith("levels=")]
     assert here(["generate", *settings, "levels=1", "executor=inline"], folder).returncode == 0
     assert json.loads(here(["status", "data/5k/s", "--json"], folder).stdout)["wanted"] == 4
-    for path in fragment_paths(split)[1:]:
-        path.unlink()
-    for path in data_paths(split):
-        shutil.rmtree(path)
-    assert here(["verify", "data/5k/s"], folder).returncode == 1
+    for fragment in fragment_paths(split)[1:]:
+        for path in made_within(data_paths(split), fragment):
+            shutil.rmtree(path)
+        fragment.unlink()
+    done = here(["verify", "data/5k/s", "--json"], folder)
+    assert done.returncode == 1
+    found = json.loads(done.stdout)
+    assert found["missing"] == [[1, 3]]
+    assert len(found["wrong"]) == 1, "that they are missing, and nothing else"
 
 
 @pytest.mark.parametrize(

@@ -13,21 +13,27 @@ from PIL import Image
 
 import levelproof
 from levelproof.configs.clone import CloneConfig
+from levelproof.configs.convert import plain
+from levelproof.configs.distill import DistillConfig
+from levelproof.configs.train import TrainConfig
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.evaluation import play, play_sampled
-from levelproof.experts.imitation import ImitationConfig, from_motion
+from levelproof.experts.imitation import ImitationConfig, compare, from_motion
 from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind
+from levelproof.experts.witness.witness import replay, steps_to_goal
+from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import ACTIONS
 from levelproof.levelgen.mirror import mirror
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.pipeline.learn import clone as module
+from levelproof.pipeline.learn import distill, sealed
 from levelproof.pipeline.learn import pool as pool_module
-from levelproof.pipeline.learn import sealed
 from levelproof.pipeline.learn.clone import COURSE
 from levelproof.pipeline.learn.curves import draw_curves
-from levelproof.pipeline.learn.pool import Feed, read_pool
+from levelproof.pipeline.learn.pool import Feed, read_pool, validation_batches
 from levelproof.pipeline.learn.sealed import SEALED
+from levelproof.pipeline.learn.trained_on import levels_for
 from levelproof.pipeline.runtime import CACHE_VARIABLE
 from levelproof.pipeline.store.locks import only_trainer
 from tests.pipeline.command import assert_refused, here
@@ -64,7 +70,19 @@ def test_loss_falls(policy: Path) -> None:
     assert [numbers[COURSE.step] for numbers in curve] == list(range(20, 201, 20))
     assert curve[-1]["bc/loss"] < 0.6 * curve[0]["bc/loss"]
     assert curve[-1]["bc/accuracy"] > 0.75
-    assert {"bc/validation_loss", "bc/validation_accuracy", "bc/samples_per_second"} <= set(curve[-1])
+    assert curve[-1]["bc/samples_per_second"] > 0
+
+
+def test_validation_compares_the_saved_policy_with_validation_levels(policy: Path, split: Path) -> None:
+    settings = replace(CloneConfig(), where="label = 'solved'", validation=0.3, train=ImitationConfig(200, batch=128))
+    source, saved = module.source_of(split, settings, print), levelproof.load_policy(policy)
+    held = validation_batches(source, settings)
+    places = lambda level: {np.ascontiguousarray(x).tobytes() for x in np.moveaxis(level.model.vertices, -1, 0)}
+    assert places(held[0].level) <= places(source.data.levels(source.validation))
+    each = [compare(saved.params, batch, saved.network) for batch in held]
+    (last,) = metrics(policy)[-1:]
+    assert last["bc/validation_loss"] == pytest.approx(np.mean([x.loss for x in each]))
+    assert last["bc/validation_accuracy"] == pytest.approx(np.mean([x.accuracy for x in each]))
 
 
 def test_validation_levels_are_played(policy: Path, split: Path) -> None:
@@ -171,6 +189,17 @@ def test_levels_weigh_equally_and_end_at_their_first_goal(split: Path) -> None:
     assert np.abs(drawn - expected).max() < 5 * expected**0.5
 
 
+def test_note_has_the_levels_and_every_setting_that_decides_a_run(split: Path) -> None:
+    first, second, *_ = levelproof.open(split).manifest["level_id"].to_pylist()
+    without = lambda level_id: replace(CloneConfig(), where=f"level_id != {level_id}", validation=0.3)
+    note, other = (
+        module.note_of([module.source_of(split, config, print)], config) for config in map(without, (first, second))
+    )
+    assert note["splits"][0]["levels"] == other["splits"][0]["levels"]
+    assert note["splits"][0]["ids"] != other["splits"][0]["ids"]
+    assert plain(without(first)).keys() - note["settings"].keys() == {"log", "interval", "played"}
+
+
 def test_levels_are_read_equally_often_if_memory_holds_two_thirds_of_them(split: Path) -> None:
     config = replace(CloneConfig(), where="", validation=0.3)
     source = module.source_of(split, config, lambda _: None)
@@ -221,11 +250,26 @@ def test_pool_has_the_mirror_images_that_solve(split: Path) -> None:
     assert len(pool.level) == len(pool.steps)
     for name in ("motion", "action"):
         np.testing.assert_array_equal(getattr(pool, name)[: len(plain_pool.motion)], getattr(plain_pool, name))
-    image = from_motion(pool.motion[pool.first[count:]], data.size)
-    starts = np.asarray(mirror(data.levels(np.arange(len(data)))).state.position)
-    for lane in range(len(pool.steps) - count):
-        same = np.abs(starts - np.asarray(image.position)[..., lane : lane + 1]).max((0, 1)) == 0
-        assert same.any()
+    steps, first = pool.steps[count:], pool.first[count:]
+    images = jax.tree.map(np.asarray, mirror(data.levels(np.arange(len(data)))))
+    starts = np.asarray(from_motion(pool.motion[first], data.size).position)
+    same = (images.state.position[..., None] == starts[:, :, None]).all((0, 1))  # image, lane
+    np.testing.assert_array_equal(same.sum(0), 1)
+    images = take(images, same.argmax(0))
+    jax.tree.map(
+        np.testing.assert_array_equal,
+        take(pool.level, np.arange(count, len(pool.steps))),
+        replace(images, state=None),  # pyright: ignore
+    )
+    row = first + np.minimum(np.arange(RECORD_STEPS)[:, None], steps - 1)
+    record = replay(images, np.moveaxis(pool.action[row], -1, 1), data.rules)
+    np.testing.assert_array_equal(steps_to_goal(record.done), steps)
+    for lane in range(len(steps)):
+        assert record.goal[steps[lane] - 1, lane]
+        states = from_motion(pool.motion[first[lane] :][: steps[lane]], data.size)
+        np.testing.assert_array_equal(
+            np.moveaxis(np.asarray(states.position), -1, 0), record.state.position[: steps[lane], ..., lane]
+        )
 
 
 def test_pool_may_have_no_mirror_image(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -271,6 +315,15 @@ def test_copies_of_sealed_levels_are_left_out(tmp_path: Path, monkeypatch: pytes
         assert sorted([*source.train, *source.validation]) == others.tolist()
         assert f"Left out {source.copies} levels of" in messages.pop()
         monkeypatch.setattr("levelproof.pipeline.learn.sealed.content_hashes", None)
+    ids = source.data.manifest["level_id"].to_numpy()
+    for starts in (1, 2):
+        trained = levels_for(TrainConfig(levels=str(copies), where="label = 'solved'", starts=starts), print)
+        assert len(trained.levels) == starts * len(others)
+        np.testing.assert_array_equal(
+            trained.levels.model.vertices[..., : len(others)], source.data.levels(others).model.vertices
+        )
+    distilled = distill.levels_for(copies, DistillConfig(where=""), print)
+    np.testing.assert_array_equal(distilled.data.manifest["level_id"].to_numpy()[distilled.chosen], ids[others])
     (kept,) = (tmp_path / "cache" / "sealed").iterdir()
     kept.write_text("[]")
     with pytest.raises(TypeError):

@@ -14,6 +14,7 @@ from safetensors.numpy import load_file
 
 import levelproof
 from levelproof.configs.compose import compose_distill
+from levelproof.configs.convert import plain
 from levelproof.configs.distill import DistillConfig
 from levelproof.experts.generalist.teachers import KnownExperts, Labels
 from levelproof.experts.labels import Label
@@ -28,7 +29,7 @@ from levelproof.pipeline.store.checkpoints import begun_like, save_experts
 from levelproof.pipeline.store.layout import EXPERTS
 from tests.pipeline.command import assert_refused, here
 from tests.pipeline.learn.runs import assert_average_is_kept, assert_guide_lists, metrics, stop_after_saving
-from tests.pipeline.made import made_job
+from tests.pipeline.made import honest_split, made_job
 
 TINY = ("network.width=8", "network.depth=1", "network.heads=1")
 ROUNDS = ("train.updates=6", "interval=2", "train.batch=32", "episodes=8", "states=16", "buffer=64")
@@ -260,13 +261,33 @@ def test_levels_are_witnessed_and_neither_trivial_nor_sealed(split: Path, monkey
     some = module.levels_for(split, DistillConfig(pool=3), print)
     few = module.witnessed(split, some, NetworkConfig(), quiet)
     assert len(few.level_ids) == len(few.levels) == len(few.witnesses.steps) == 3
-    monkeypatch.setattr(module, "Label", type("Trivial", (), {"TRIVIAL": Label.SOLVED}))
-    with pytest.raises(levelproof.UserError, match="only trivial levels"):
-        module.levels_for(split, config, print)
-    monkeypatch.undo()
     monkeypatch.setattr(sealed, "SEALED", range(int(ids[0]), int(ids[0]) + 1))
     with pytest.raises(levelproof.UserError, match="sealed to measure policies"):
         module.levels_for(split, config, print)
+
+
+def test_note_has_the_levels_and_every_setting_that_decides_a_run(split: Path) -> None:
+    first, second, *_ = levelproof.open(split).manifest["level_id"].to_pylist()
+    start = lambda level_id, policy: DistillConfig(where=f"level_id != {level_id}", start=policy)
+    notes = [
+        module.note_of(module.levels_for(split, config, print), config)
+        for config in (start(first, "builtin:s"), start(second, "builtin:s"), start(first, "builtin:m"))
+    ]
+    ids, starts = [note["splits"][0]["ids"] for note in notes], [note["start"] for note in notes]
+    assert ids[0] == ids[2] != ids[1]
+    assert starts[0] == starts[1] != starts[2]
+    assert plain(DistillConfig()).keys() - notes[0]["settings"].keys() == {"log"}
+
+
+def test_trivial_levels_are_left_out(tmp_path: Path) -> None:
+    split = honest_split(tmp_path, 16, 2)
+    data = levelproof.open(split)
+    labels = np.array(data.manifest["label"].to_pylist())
+    chosen = module.levels_for(split, DistillConfig(where=""), print)
+    np.testing.assert_array_equal(chosen.chosen, np.flatnonzero(labels != Label.TRIVIAL))
+    assert 0 < len(chosen.chosen) < len(data)
+    with pytest.raises(levelproof.UserError, match="only trivial levels"):
+        module.levels_for(split, DistillConfig(where="label = 'trivial'"), print)
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from rich.console import Console
 import levelproof
 from levelproof.experts.networks.saved import WEIGHTS
 from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.learn.clone import COURSE
 from levelproof.pipeline.learn.folder import (
     CHECKPOINT,
     MADE_BY,
@@ -27,7 +28,7 @@ from levelproof.pipeline.learn.folder import (
     write_note,
     writing_run,
 )
-from levelproof.pipeline.learn.metrics import METRICS
+from levelproof.pipeline.learn.metrics import METRICS, Metrics
 from levelproof.pipeline.store.layout import WRITER_LOCK
 
 STATE = {"step": np.int32(3)}
@@ -92,6 +93,14 @@ def test_what_a_killed_command_left_is_removed(tmp_path: Path) -> None:
     with writing_run(out) as require_ours:
         require_ours()
     assert {path.name for path in out.iterdir()} == {"mine.123", WRITER_LOCK}
+
+
+def test_metrics_drop_a_half_written_line_and_later_ones(tmp_path: Path) -> None:
+    lines = ['{"bc/updates": 1}', '{"bc/updates": 2}', '{"bc/updates": 3}', '{"bc/upd']
+    (tmp_path / METRICS).write_text("\n".join(lines))
+    with Metrics(tmp_path, COURSE, "none", {}, 2, print, lambda: None) as kept:
+        assert kept.last == {"bc/updates": 2}
+    assert (tmp_path / METRICS).read_text() == "".join(f"{line}\n" for line in lines[:2])
 
 
 def test_run_that_another_stack_began_continues_and_says_so(tmp_path: Path) -> None:

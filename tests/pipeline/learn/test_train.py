@@ -10,15 +10,15 @@ import pytest
 from safetensors.numpy import load_file
 
 import levelproof
+from levelproof.configs.convert import plain
 from levelproof.configs.train import TrainConfig
 from levelproof.experts.generalist.config import EvolveConfig, LearnabilityConfig, PPOConfig, ReplayConfig
 from levelproof.experts.generalist.train import _programs as programs
-from levelproof.experts.networks.saved import WEIGHTS, Policy
+from levelproof.experts.networks.saved import Policy, policy_folder
 from levelproof.levelgen.task.lanes import FIRST_EXTRA
 from levelproof.pipeline.exchange.level_json import export
 from levelproof.pipeline.learn import sealed
 from levelproof.pipeline.learn import train as module
-from levelproof.pipeline.learn.folder import weights_digest
 from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.trained_on import levels_for
 from tests.pipeline.command import assert_refused, here
@@ -52,12 +52,12 @@ def easy(split: Path) -> tuple[str, ...]:
 
 @pytest.fixture(scope="module")
 def agent(easy: tuple[str, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return trained(tmp_path_factory.mktemp("trained"), 60, "interval=10", *easy)
+    return trained(tmp_path_factory.mktemp("trained"), 2, *easy)
 
 
 @pytest.mark.slow
-def test_solve_rate_rises_on_an_easy_set(agent: Path) -> None:
-    curve = metrics(agent)
+def test_solve_rate_rises_on_an_easy_set(easy: tuple[str, ...], tmp_path: Path) -> None:
+    curve = metrics(trained(tmp_path, 60, "interval=10", *easy))
     assert [line["train/env_steps"] for line in curve] == [10 * PER_UPDATE * n for n in range(1, 7)]
     rate = [line["train/solve_rate"] for line in curve]
     assert np.mean(rate[-2:]) > np.mean(rate[1:3]) + 0.05, rate  # the first line has none but short episodes
@@ -88,7 +88,7 @@ def test_diverged_weights_are_not_kept(easy: tuple[str, ...], tmp_path: Path) ->
 @pytest.mark.slow
 def test_folder_holds_a_policy_that_loads_and_is_evaluated(agent: Path, split: Path) -> None:
     policy = levelproof.load_policy(agent)
-    assert policy.origin["env_steps"] == 60 * PER_UPDATE
+    assert policy.origin["env_steps"] == 2 * PER_UPDATE
     assert (agent / "config.json").stat().st_size < 4_000
     done = here(["evaluate", str(agent), "--on", str(split), "--levels", "8", "--attempts", "1"], agent.parent)
     assert done.returncode == 0, done.stderr
@@ -297,12 +297,17 @@ def test_folder_with_the_note_of_another_command_is_refused(note: Any, tmp_path:
     assert_refused(here(["train", *LANES, *TINY], tmp_path), 2, "has a run with other settings or levels")
 
 
-def test_training_starts_from_linked_weights(agent: Path, tmp_path: Path) -> None:
-    """As those of a policy downloaded from the Hugging Face hub are."""
-    for file in agent.iterdir():
+def test_note_has_the_start_and_every_setting_that_decides_a_run(tmp_path: Path) -> None:
+    """The weights of the start may be linked, as those downloaded from the Hugging Face hub are."""
+    for file in policy_folder("builtin:s").iterdir():
         (tmp_path / file.name).symlink_to(file)
-    assert weights_digest(str(tmp_path)) == weights_digest(str(agent))
-    assert (tmp_path / WEIGHTS).is_symlink()
+    starts = ("", "builtin:s", "builtin:m", str(tmp_path))
+    configs = [TrainConfig(start=start) for start in starts]
+    notes = [module.note_of(config, levels_for(config, print), 1) for config in configs]
+    scratch, small, medium, linked = (note["start"] for note in notes)
+    assert scratch is None
+    assert small == linked != medium
+    assert plain(configs[0]).keys() - notes[0]["settings"].keys() == {"log", "interval", "cores"}
 
 
 def test_guides_list_every_setting_with_its_default_and_meaning() -> None:

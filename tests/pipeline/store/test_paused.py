@@ -81,7 +81,7 @@ def test_drop_keeps_experts_of_levels_that_were_cut_from_the_unit(split: Path, k
 
 
 def test_load_paused_prefers_the_later_checkpoint(split: Path, kept: dict[int, Paused]) -> None:
-    save_paused(split, unit_name(0, 4), {3: kept[7]}, JOB)
+    save_paused(split, unit_name(0, 7), {3: kept[7], 7: kept[3]}, JOB)  # listed before UNIT
     same(load_paused(split, range(8), JOB), {3: kept[7], 7: kept[7]})
 
 
