@@ -128,8 +128,8 @@ def run(args: argparse.Namespace) -> Report:
         ],
         [
             f"Every policy has at most {args.core_seconds:,.0f} core-seconds of one core, with compiling, for all "
-            f"that it is made from: the search of {args.levels} levels (`procedure=label budget=16k`, ids from {FIRST:,} on, for the "
-            f"second seed from {FIRST + BETWEEN_SEEDS:,}), the clone "
+            f"that it is made from: the search of {args.levels} levels (`procedure=label budget=16k`, ids from "
+            f"{FIRST:,} on, for the second seed from {FIRST + BETWEEN_SEEDS:,}), the clone "
             f"({', '.join((f'{args.updates:,} updates', *(f'`{each}`' for each in (*SCRATCH, *args.cloning))))}), and "
             "reinforcement learning for the rest, on random levels unless a way says otherwise"
             f"{f'; what {START} took is not counted' if any(WAYS[way].start == START for way in shown) else ''}. "

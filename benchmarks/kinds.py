@@ -23,9 +23,11 @@ from levelproof.configs.clone import CloneConfig
 from levelproof.configs.compose import compose_clone
 from levelproof.experts.config import ExpertConfig
 from levelproof.experts.imitation import Imitation, Transitions, begin_imitation, imitate
+from levelproof.experts.networks.chunks import lanes_at_once
 from levelproof.experts.policy import initial, network_of
 from levelproof.experts.pool.pool import slot_count
 from levelproof.experts.training import ppo
+from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import name_of
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.actions import action_mask
@@ -175,7 +177,7 @@ def speeds(args: argparse.Namespace) -> dict[str, Any]:
             "size": name_of(size),
             "batch": batch,
             "samples_per_second": batch / seconds,
-            "flops_per_sample": update.flops / batch,
+            "flops_per_sample": update.flops_per_sample,
             "weights": sum(x.size for x in jax.tree.leaves(update.state.params)),
             "feeding": feeds[name] / (feeds[name] + seconds),
         }
@@ -188,7 +190,9 @@ class Update:
     def __init__(self, source: PartedSplit, config: CloneConfig, batch: Transitions) -> None:
         self._batch, self._config = batch, config
         self.state: Imitation = begin_imitation(np.int32(0), config.network, size_for([source], config), config.train)
-        self.flops = flops_of(imitate.lower(self.state, batch, config.network, config.train))
+        few = lanes_at_once(batch.level.size, config.train.batch)  # of chunks, XLA counts a single one
+        chunk = Transitions(take(batch.level, np.arange(few)), batch.motion[:few], batch.action[:few])
+        self.flops_per_sample = flops_of(imitate.lower(self.state, chunk, config.network, config.train)) / few
 
     def __call__(self) -> Any:
         for _ in range(FEW):

@@ -24,8 +24,8 @@ from levelproof.levelgen.task.actions import CHOICES, action_mask
 from levelproof.levelgen.task.fresh import renewed
 from levelproof.levelgen.task.rules import StepResult, TaskParams, TaskState
 
-LANES = 1024  # that play side by side
-QUEUED = 8  # episodes of a batch for each lane; at a batch's end, lanes wait for its last episodes
+LANES = 256  # that play side by side
+QUEUED = 32  # episodes of a batch for each lane; at a batch's end, lanes wait for its last episodes
 STAY = 0.9  # chance that sticky random play repeats an entry of the previous action
 
 
