@@ -47,8 +47,8 @@ def run(args: argparse.Namespace) -> Report:
         "Env steps are those that reinforcement learned from: not those in which learnability measured levels, nor "
         "those of searches for demonstrations. `builtin:s` and `builtin:m` have neither.",
         *(
-            f"`{policy}` also learned from demonstrations, whose env steps are not counted: witnesses of {count:,} "
-            "levels."
+            f"`{policy}` also learned from demonstrations, whose env steps are not counted: witnesses of up to "
+            f"{count:,} levels."
             for policy in args.policies
             if (count := demonstrated(policy))
         ),

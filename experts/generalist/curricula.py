@@ -1,4 +1,4 @@
-"""Curricula choose the level of each new episode: an initial state, a draw, and an update from the episodes that ended.
+"""A curriculum chooses each new episode's level: its state decides the draw, and learns from the episodes that ended.
 
 A curriculum sees levels as indices into a table. For random levels the table is a sampler and the index is the level's
 id, so only ids are stored; `evolve` also stores the levels that it edits. `learnability`, `replay` and `evolve` have
@@ -21,7 +21,7 @@ Attempt = Callable[[Int[Array, " level"], int, Key[Array, ""]], tuple[Array, Arr
 
 
 class EndedEpisodes(NamedTuple):
-    """Episodes of all lanes and cores in one update, one per action and lane; the rest counts where `done`."""
+    """One entry per action and lane of an update, of all cores; the other fields mean something only where `done`."""
 
     done: Bool[Array, " episode"]
     level_index: Int[Array, " episode"]

@@ -54,11 +54,11 @@ class UpdateFacts(NamedTuple):
 
     episodes: Int[Array, ""]  # that ended
     solved: Int[Array, ""]  # of them
-    env_steps: Int[Array, ""]  # of them
+    env_steps: Int[Array, ""]  # of them, each episode's rounded up to whole actions
     reward: Float[Array, ""]  # sum over them, shaping included
     entropy: Float[Array, ""]  # of the policy's live entries, nats; this and what follows are means over samples
     value_error: Float[Array, ""]
-    kl_to_before: Float[Array, ""]  # estimate of KL(policy before || after), nats
+    kl_to_before: Float[Array, ""]  # estimate of KL(policy before || now), nats, mean over the update's minibatches
     kl_to_start: Float[Array, ""]  # KL(policy || policy that training started from), nats; 0: none
 
 
@@ -160,7 +160,7 @@ def _advance(
         learner.params, recipe.network, table, learner.playing, draw, of_rollout, ppo.horizon,
         recipe.rules,
     )  # fmt: skip
-    chunks = _chunks(recipe, experience, start, update, of_choice)
+    chunks = _chunks(recipe, experience, start if ppo.kl_weight else None, update, of_choice)
     params, optimiser, means = _epochs(recipe, learner, chunks, of_epochs, start is not None)
     after = Learner(
         params,
@@ -199,7 +199,7 @@ def _advantages(experience: Experience, config: PPOConfig) -> Float[Array, "time
 
 
 def _samples(ppo: PPOConfig, experience: Experience, key: Key[Array, ""]) -> Chunk:
-    """Return the samples of a core that are learned from, time first."""
+    """Return a core's samples, time first; with `subsample` 1 all of them, those not learned from with weight 0."""
     counts = ~_open_ended(experience)
     advantage = _advantages(experience, ppo)
     gain = normalised_over(CORES, advantage, counts)
@@ -288,7 +288,7 @@ def _loss(
     from_start = jnp.zeros(())
     if len(chunk.logits_of_start):
         from_start = mean(divergence(logits, chunk.logits_of_start, chunk.live))
-        total += jnp.where(kl_weight > 0, kl_weight * from_start, 0.0)
+        total += kl_weight * from_start
     return total, (now.entropy, now.value_error, moved, jnp.where(kl_weight > 0, from_start, 0.0))
 
 

@@ -21,7 +21,7 @@ def renewed(
     """Return `before` (arrays, lanes last) with `begin(level_ids)` in the lanes that are done.
 
     Gathers the lanes that are done and begins them in blocks of LANES, as the sampler's kernel does; the other lanes
-    cost nothing.
+    cost next to nothing, and the last block begins up to LANES - 1 levels in vain.
     """
     count = done.shape[-1]
     (waiting,) = jnp.nonzero(done, size=-(-count // LANES) * LANES, fill_value=count)
