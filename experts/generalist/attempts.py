@@ -136,9 +136,7 @@ def attempt_from(
         )
 
     taken = jnp.zeros((RECORD_STEPS, ACTIONS, lanes), jnp.int8)
-    previous = jnp.where(
-        live, evenly(uniform(jnp.int32(RECORD_STEPS))), 0
-    )  # for sticky play: drawn, not the learner's
+    previous = jnp.where(live, evenly(uniform(jnp.int32(RECORD_STEPS))), 0)  # for sticky play: drawn, not the learner's
     begun = _Trying(jnp.int32(0), now, previous, now.timestep >= RECORD_STEPS, none, none, taken, none)
     end = jax.lax.while_loop(lambda trying: ~trying.ended.all() & (trying.step < RECORD_STEPS), act, begun)
     best = jnp.arange(states) * attempts + end.best

@@ -27,13 +27,13 @@ from levelproof.pipeline.store.checkpoints import save_experts
 from levelproof.pipeline.store.disk import explaining_writes, flush_entry
 from levelproof.pipeline.store.fields import arrays_of
 from levelproof.pipeline.store.files import write
-from levelproof.pipeline.store.layout import WRITER_LOCK, new_attempt, unit_name
+from levelproof.pipeline.store.layout import WRITER_LOCK, data_paths, new_attempt, unit_name
 from levelproof.pipeline.store.locks import only_writer
 from levelproof.pipeline.store.manifest import begin_fragment, fragment_paths, write_fragment
 from levelproof.pipeline.store.shard import write_shard
 from tests.pipeline.command import ROOT
 from tests.pipeline.driver import commit_made
-from tests.pipeline.made import made_job, made_level, made_record
+from tests.pipeline.made import honest_split, made_job, made_level, made_record
 
 FULLFSYNC = 51  # macOS's number of F_FULLFSYNC
 
@@ -166,15 +166,24 @@ def test_only_to_drive_calls_fsync() -> None:
     assert calls == {"disk.py"}
 
 
-def test_commit_flushes_experts_before_the_fragment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    flushed: set[Path] = set()
-    fsync = os.fsync
+def test_commit_flushes_shards_and_experts_before_the_fragment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    events: list[tuple[str, Path]] = []
+    fsync, replace = os.fsync, os.replace
 
-    def note(descriptor: int) -> None:
+    def flush(descriptor: int) -> None:
         fsync(descriptor)
-        flushed.add(Path(os.readlink(f"/proc/self/fd/{descriptor}")))
+        events.append(("flushed", Path(os.readlink(f"/proc/self/fd/{descriptor}"))))
 
-    monkeypatch.setattr(os, "fsync", note)
-    experts = new_attempt(tmp_path, unit_name(0, 0)).experts
-    save_experts(experts, kept_experts())
-    assert flushed >= {tmp_path, experts.parent, experts}
+    def move(source: Path, target: Path) -> None:
+        replace(source, target)
+        events.append(("moved", Path(target)))
+
+    monkeypatch.setattr(os, "fsync", flush)
+    monkeypatch.setattr(os, "replace", move)
+    split = honest_split(tmp_path, 16, 1, experts=True)
+    (fragment,) = fragment_paths(split)
+    committed = events.index(("moved", fragment))
+    data = [path for folder in data_paths(split) for path in (folder, *folder.rglob("*")) if path.is_file()]
+    assert {path.suffix for path in data_paths(split)} == {".zarr", ".npz"}
+    assert {path for what, path in events[:committed] if what == "flushed"} >= {*data, *(x.parent for x in data)}
+    assert ("flushed", fragment.parent) in events[committed:]
