@@ -24,7 +24,6 @@ from levelproof.levelgen.task.observe.flat import (
 from levelproof.physics.types import FIXED_POLYGONS, Size, State
 
 GOALS = (Role.GREEN, Role.BLUE, Role.RED)
-FAR = 1e6  # m^2, beyond any squared distance in a world
 
 
 class EntityTables(NamedTuple):
@@ -88,7 +87,9 @@ def _relative(level: Level, entities: Placed) -> Float[Array, "entity column lan
     return _stacked(columns)
 
 
-def _nearest(state: State, candidate: Bool[Array, "body lane"], at: Array) -> tuple[Array, Array]:
+def _nearest(
+    state: State, candidate: Bool[Array, "body lane"], at: Float[Array, "entity 2 lane"]
+) -> tuple[Float[Array, "entity 2 lane"], Float[Array, "entity 2 lane"]]:
     """Return where the nearest candidate is, seen from each point, and its velocity; zeros if there is none.
 
     Body after body, because XLA's argmin over all bodies is slow on CPUs.
@@ -134,7 +135,8 @@ def _at(bodies: Placed, index: np.ndarray) -> Placed:
 
 
 def _rows_of(at: Float[Array, "entity body lane"], rows: Float[Array, "body row lane"]) -> Array:
-    return sum(at[:, b, None] * rows[b] for b in range(len(rows)))  # einsum would multiply a tiny matrix in each lane
+    # einsum would multiply a tiny matrix in each lane
+    return sum((at[:, body, None] * rows[body] for body in range(len(rows))), jnp.zeros(()))
 
 
 def _one_hot(index: Array, count: int) -> Float[Array, "entity count lane"]:
