@@ -24,7 +24,7 @@ from levelproof.levelgen.task.actions import CHOICES, action_mask
 from levelproof.levelgen.task.fresh import renewed
 from levelproof.levelgen.task.rules import StepResult, TaskParams, TaskState
 
-LANES = 256  # that play side by side
+LANES = 256  # that play side by side; measured on a CPU core
 QUEUED = 32  # episodes of a batch for each lane; at a batch's end, lanes wait for its last episodes
 STAY = 0.9  # chance that sticky random play repeats an entry of the previous action
 

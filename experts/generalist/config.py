@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from levelproof.levelgen.task.rules import MAX_REWARD_SCALE, TaskParams
 from levelproof.physics.bounds import require
 
-CHUNK = 256  # samples of a minibatch come in chunks of so many lanes of one time step
+CHUNK = 256  # what lanes, samples and measured levels are multiples of, or fewer; a CPU cuts them further
 
 MAX_REPEAT = 256  # env steps; an episode of the default rules is then one action
 

@@ -17,7 +17,10 @@ T = TypeVar("T")
 
 
 def lanes_at_once(size: Size, lanes: int) -> int:
-    """Return the number of lanes of a chunk, a divisor of `lanes`: on a CPU few, on a GPU all."""
+    """Return the number of lanes of a chunk, a divisor of `lanes`.
+
+    On a CPU these are few, unless no divisor is near to what fits the cache; then, and on a GPU, all.
+    """
     if jax.default_backend() != "cpu":
         return lanes
     entities = size.polygons - FIXED_POLYGONS + 1 + size.circles + size.joints + size.thrusters

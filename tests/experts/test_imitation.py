@@ -1,10 +1,24 @@
 """The loss of cloning: averaged over live entries, then over transitions."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
 
-from levelproof.experts.imitation import Transitions, compare, from_motion, to_motion
+from levelproof.experts.imitation import (
+    Imitation,
+    ImitationConfig,
+    Likeness,
+    Transitions,
+    begin_imitation,
+    compare,
+    from_motion,
+    imitate,
+    to_motion,
+)
+from levelproof.experts.networks import chunks
+from levelproof.experts.networks.chunks import lanes_at_once
 from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy, policy_logits
 from levelproof.experts.policy import most_probable
 from levelproof.levelgen.level import SIZES
@@ -44,3 +58,24 @@ def test_loss_and_accuracy_are_means_over_live_entries_then_over_transitions() -
     idle = np.where(live, action, (action + 1) % CHOICES)
     other = compare(params, Transitions(levels, motion, idle), NETWORK)
     assert (float(other.loss), float(other.accuracy)) == (float(likeness.loss), float(likeness.accuracy))
+
+
+def test_update_is_the_same_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    levels = jax.tree.map(np.asarray, sample_levels(np.arange(COUNT), "s"))
+    action = np.random.default_rng(0).integers(0, CHOICES, (COUNT, len(CHOICES))).astype(np.int32)
+    motion = np.asarray(to_motion(levels.state, contacts=False))
+    transitions = Transitions(replace(levels, state=None), motion, action)  # pyright: ignore
+    config = ImitationConfig(updates=10, batch=COUNT)
+
+    def updated() -> tuple[Imitation, Likeness]:
+        begun = begin_imitation(np.int32(0), NETWORK, levels.size, config)
+        update = jax.jit(imitate.__wrapped__, static_argnums=(2, 3))  # without what was compiled before
+        for _ in range(2):
+            begun, likeness = update(begun, transitions, NETWORK, config)
+        return begun, likeness
+
+    assert lanes_at_once(levels.size, COUNT) == COUNT
+    whole = updated()
+    monkeypatch.setattr(chunks, "ENTITIES", 24)
+    assert lanes_at_once(levels.size, COUNT) == 4
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-3, atol=1e-5), updated(), whole)

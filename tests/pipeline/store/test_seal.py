@@ -292,16 +292,22 @@ def test_active_readers_survive_a_seal(split: Path, made: Path) -> None:
                     assert tuple(values.tobytes() for values in data.values()) == expected[row["level_id"]][1]
             passed.release()
 
+    def await_passes(count: int) -> None:
+        while passed.acquire(blocking=False):  # those of before
+            pass
+        assert all(passed.acquire(timeout=patience(60)) for _ in range(count))
+
     with ThreadPoolExecutor() as threads:
         readers = [threads.submit(read) for _ in range(2)]
         try:
             for rows in (2, 5, 100):
-                assert passed.acquire(timeout=patience(60)), "readers are at work when it begins"
+                await_passes(1)
                 sealed(split, rows)
+            await_passes(3)  # of two readers, one began its last pass after the last seal
         finally:
             ended.set()
-        for reader in readers:
-            reader.result()
+            for reader in readers:
+                reader.result()
     assert_tidy(split, 1)
 
 
