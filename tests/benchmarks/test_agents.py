@@ -20,7 +20,8 @@ def test_report_compares_policies_on_published_levels(tmp_path: Path, reference:
     random, handmade = report.tables
     assert [row[0] for row in random.rows] == ["doing nothing", "random", "sticky random", "**builtin:s**"]
     origin = load_policy("builtin:s").origin
-    assert random.rows[-1][1] == f"{origin['env_steps']:,}, random s"
+    trained = [origin["start_origin"]["env_steps"], origin["env_steps"]]
+    assert random.rows[-1][1] == "; ".join(f"{steps:,}, random s" for steps in trained)
     assert not any("demonstrations, whose" in note for note in report.notes)
     assert [row[0] for row in handmade.rows] == [row[0] for row in random.rows], "published rates are of all levels"
     assert run(parser("agents").parse_args(words)).results == report.results
