@@ -11,7 +11,7 @@ import optax
 from flax.typing import VariableDict
 from jaxtyping import Array, Float, Int
 
-from levelproof.experts.networks.chunks import in_chunks, lanes_at_once
+from levelproof.experts.networks.chunks import in_chunks, lanes_at_once, mean_gradient
 from levelproof.experts.networks.over_levels import NetworkConfig, initial_policy, policy_logits
 from levelproof.experts.optimise import running_average
 from levelproof.experts.policy import log_probability, most_probable
@@ -98,16 +98,7 @@ def imitate(
     now: Imitation, transitions: Transitions, network: NetworkConfig, config: ImitationConfig
 ) -> tuple[Imitation, Likeness]:
     """Take one update; return the likeness before it."""
-    loss = jax.value_and_grad(_loss, has_aux=True)
-
-    def add(total: Any, chunk: Transitions) -> tuple[Any, None]:
-        (_, likeness), gradient = loss(now.params, chunk, network)
-        return jax.tree.map(jnp.add, total, (gradient, likeness)), None
-
-    chunks = _chunks(transitions)
-    zeros = jax.tree.map(jnp.zeros_like, (now.params, Likeness(jnp.zeros(()), jnp.zeros(()))))
-    total, _ = jax.lax.scan(add, zeros, chunks)
-    gradient, likeness = jax.tree.map(lambda x: x / len(chunks.motion), total)
+    gradient, likeness = mean_gradient(partial(_loss, network=network), now.params, _chunks(transitions))
     change, state = optimiser_of(config).update(gradient, now.optimiser, now.params)
     params: Any = optax.apply_updates(now.params, change)
     average = running_average(now.average, params, now.updates, config.average)

@@ -22,7 +22,7 @@ from levelproof.experts.generalist.config import CHUNK, PPOConfig
 from levelproof.experts.generalist.curricula import Curriculum, EndedEpisodes
 from levelproof.experts.generalist.rollout import Ended, Experience, Playing, begin, rollout
 from levelproof.experts.generalist.subsample import LEAST, choose
-from levelproof.experts.networks.chunks import lanes_at_once
+from levelproof.experts.networks.chunks import in_chunks, lanes_at_once, mean_gradient
 from levelproof.experts.networks.layers import LOGITS
 from levelproof.experts.networks.over_levels import NetworkConfig, logits_and_summary
 from levelproof.experts.objective import advantages, normalised_over, terms
@@ -35,7 +35,6 @@ from levelproof.physics.types import Size
 
 CORES = "core"  # axis of the mesh
 BEGINNING, PLAYING, MEASURING, BREEDING = range(1, 5)  # folded into the seed's key; cloning uses that key itself
-TERMS = 4  # means over samples in UpdateFacts
 
 
 class Learner(NamedTuple):
@@ -220,14 +219,10 @@ def _chunks(
 ) -> Chunk:
     """Return a core's samples as chunks, chunk axis first."""
     samples = _samples(recipe.ppo, experience, key)
-    count = samples.value.shape[-1]
-    width = lanes_at_once(recipe.size, min(count, CHUNK))
+    width = lanes_at_once(recipe.size, min(samples.value.shape[-1], CHUNK))
 
-    def cut(x: Array) -> Array:  # [time, ..., sample] to [chunk, ..., sample]
-        parted = jnp.moveaxis(x.reshape(*x.shape[:-1], count // width, width), -2, 1)
-        return parted.reshape(parted.shape[0] * parted.shape[1], *parted.shape[2:])
-
-    chunks = jax.tree.map(cut, samples)
+    parted = jax.vmap(partial(in_chunks, lanes=width))(samples)  # time first, then the chunks of each time step
+    chunks = jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), parted)
     if start is None:
         return chunks
     logits = lambda observation: logits_and_summary(start, recipe.network, recipe.size, observation)[0]
@@ -242,19 +237,12 @@ def _epochs(
     """Pass over a core's chunks several times in minibatches; return weights, optimiser and means of the terms."""
     ppo, update, count = recipe.ppo, learner.updates, len(chunks.value)
     fitting = (update < ppo.critic_updates) if starts else jnp.array(False)
-    loss = jax.value_and_grad(partial(_loss, recipe=recipe, kl_weight=_kl_weight(ppo, update)), has_aux=True)
+    loss = partial(_loss, recipe=recipe, kl_weight=_kl_weight(ppo, update))
 
     def learn(now: tuple[Any, Any], index: Int[Array, " chunk"]) -> tuple[tuple[Any, Any], Any]:
         params, state = now
         batch = jax.tree.map(lambda x: x[index], chunks)
-
-        def add(total: Any, each: Chunk) -> tuple[Any, None]:
-            (_, means), gradient = loss(params, each)
-            return jax.tree.map(jnp.add, total, (gradient, means)), None
-
-        zeros = jax.tree.map(jnp.zeros_like, (params, (0.0,) * TERMS))
-        total, _ = jax.lax.scan(add, zeros, batch)
-        gradient, means = jax.lax.pmean(jax.tree.map(lambda x: x / len(index), total), CORES)
+        gradient, means = jax.lax.pmean(mean_gradient(loss, params, batch), CORES)
         if starts:
             gradient = gradient._replace(policy=jax.tree.map(lambda x: jnp.where(fitting, 0, x), gradient.policy))
         change, state = clipped_adam(ppo).update(gradient, state, params)

@@ -97,7 +97,7 @@ def distill(split: Path, config: DistillConfig, out: Path, console: Console) -> 
     note = note_of(chosen, config)
     with writing_run(out) as require_ours:
         require_same_run(out, note)
-        taught = witnessed(split, chosen, network, console)
+        taught = witnessed(chosen, network, console)
         params = start.params if start else None
         columns = taught.witnesses.motion.shape[1]
         fresh = Distillation(
@@ -159,8 +159,8 @@ def levels_for(split: Path, config: DistillConfig, tell: Callable[[str], None]) 
     return ChosenLevels(data, chosen, facts, experts)
 
 
-def witnessed(split: Path, levels: ChosenLevels, network: NetworkConfig, console: Console) -> TaughtLevels:
-    """Read levels with their witnesses, in the form in which the network sees them.
+def witnessed(levels: ChosenLevels, network: NetworkConfig, console: Console) -> TaughtLevels:
+    """Read chosen levels with their witnesses, as far as the network reads their states.
 
     Raises:
         Failure: their data is damaged.
@@ -169,7 +169,7 @@ def witnessed(split: Path, levels: ChosenLevels, network: NetworkConfig, console
     with ProgressBar("levels read", len(chosen), console) as bar:
         witnesses = read_pool(data, chosen, network, follow=bar.advance)
     ids = data.manifest["level_id"].to_numpy()[chosen]
-    return TaughtLevels(split, ids, data.levels(chosen), witnesses, levels.experts, data.rules)
+    return TaughtLevels(ids, data.levels(chosen), witnesses, levels.experts, data.rules)
 
 
 def note_of(levels: ChosenLevels, config: DistillConfig) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """Rounds of distilling: the learner plays, teachers label states of its episodes, and experts show their levels."""
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -31,7 +30,6 @@ ASKING, SHOWING = 7, 8  # folded into the seed's key; `experts.generalist.train`
 class TaughtLevels(NamedTuple):
     """The levels of a run, with what teachers know of them."""
 
-    split: Path
     level_ids: Int[np.ndarray, " level"]
     levels: Level  # with first states; on the host, level axis last
     witnesses: LevelPool

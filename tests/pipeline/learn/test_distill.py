@@ -248,7 +248,7 @@ class _With:
 def test_levels_are_witnessed_and_neither_trivial_nor_sealed(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config, quiet = DistillConfig(), Console(quiet=True)
     chosen = module.levels_for(split, config, print)
-    taught = module.witnessed(split, chosen, NetworkConfig(), quiet)
+    taught = module.witnessed(chosen, NetworkConfig(), quiet)
     data = levelproof.open(split, where="label = 'solved'")
     ids = data.manifest["level_id"].to_numpy()
     assert np.array_equal(taught.level_ids, ids)
@@ -259,7 +259,7 @@ def test_levels_are_witnessed_and_neither_trivial_nor_sealed(split: Path, monkey
         assert np.array_equal(witness[:first, :, i], stored.action[i, :first])
         assert (witness[first:, :, i] == stored.action[i, first - 1]).all()
     some = module.levels_for(split, DistillConfig(pool=3), print)
-    few = module.witnessed(split, some, NetworkConfig(), quiet)
+    few = module.witnessed(some, NetworkConfig(), quiet)
     assert len(few.level_ids) == len(few.levels) == len(few.witnesses.steps) == 3
     monkeypatch.setattr(sealed, "SEALED", range(int(ids[0]), int(ids[0]) + 1))
     with pytest.raises(levelproof.UserError, match="sealed to measure policies"):
