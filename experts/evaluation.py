@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Int8, Key
 
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.networks.over_levels import NetworkConfig, policy_logits
@@ -115,33 +115,45 @@ def play(
     return FirstEpisodes(*(np.concatenate(column)[:count] for column in zip(*parts, strict=True)))
 
 
-def first_actions(
+class FirstAttempts(NamedTuple):
+    """The first attempt at each level."""
+
+    action: Int8[np.ndarray, "256 6 level"]  # those after the end mean nothing
+    env_steps: Int[np.ndarray, " level"]
+    solved: Bool[np.ndarray, " level"]
+
+
+def first_attempts(
     player: Player,
     params: Any,
     levels: Level,
     level_ids: Int[np.ndarray, " level"],
     seed: int,
     rules: TaskParams,
-) -> Int[np.ndarray, "256 6 level"]:
-    """Return the actions that `play` takes in the first attempt at each level; those after its end mean nothing.
+) -> FirstAttempts:
+    """Return the first attempt that `play` makes at each level, with its actions.
 
     Arguments are those of `play`; all levels are played at once.
     """
-    return np.asarray(_recorder(player, rules)(params, levels, level_ids, np.uint32(seed)))
+    return jax.device_get(_recorder(player, rules)(params, levels, level_ids, np.uint32(seed)))
 
 
 @lru_cache(maxsize=4)
-def _recorder(player: Player, rules: TaskParams) -> Callable[..., Int[Array, "256 6 level"]]:
+def _recorder(player: Player, rules: TaskParams) -> Callable[..., FirstAttempts]:
     """Compile the first attempts at a batch of levels."""
 
     @jax.jit
-    def run(params: Any, levels: Level, level_ids: Int[Array, " level"], seed: Array) -> Int[Array, "256 6 level"]:
-        def act(attempt: _Attempt, _: Any) -> tuple[_Attempt, Int[Array, "6 level"]]:
-            after = _step(player, params, attempt, rules)[0]
-            return after, after.previous
+    def run(params: Any, levels: Level, level_ids: Int[Array, " level"], seed: Array) -> Any:
+        def act(before: Any, _: Any) -> tuple[Any, Array]:
+            attempt, going, steps, solved = before
+            attempt, result = _step(player, params, attempt, rules)
+            after = attempt, going & ~result.done, steps + going, solved | (going & result.goal)
+            return after, attempt.previous.astype(jnp.int8)
 
-        begun = _begun(levels, _keys(level_ids, seed, jnp.arange(1)))
-        return jax.lax.scan(act, begun, length=RECORD_STEPS)[1]
+        none = jnp.zeros(len(level_ids), bool)
+        begun = _begun(levels, _keys(level_ids, seed, jnp.arange(1))), ~none, none.astype(jnp.int32), none
+        (_, _, steps, solved), action = jax.lax.scan(act, begun, length=RECORD_STEPS)
+        return FirstAttempts(action, steps, solved)  # pyright: ignore
 
     return run
 

@@ -1,19 +1,19 @@
 """Rounds of distilling: the learner plays, teachers label states of its episodes, and experts show their levels."""
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from flax.typing import VariableDict
-from jaxtyping import Array, Bool, Int, Int8, Key
+from jaxtyping import Array, Int, Int8, Key
 
 from levelproof.configs.distill import DistillConfig
 from levelproof.experts.config import RECORD_STEPS
-from levelproof.experts.evaluation import first_actions, play_sampled
+from levelproof.experts.evaluation import FirstAttempts, first_attempts, play_sampled
 from levelproof.experts.generalist.demonstrations import demonstrations
 from levelproof.experts.generalist.teachers import AT_ONCE, Asked, KnownExperts, Labels, Teacher, label_states
-from levelproof.experts.generalist.visited import draw_states, visit
+from levelproof.experts.generalist.visited import draw_states, state_at
 from levelproof.experts.networks.over_levels import NetworkConfig
 from levelproof.levelgen.batching import blocks, take
 from levelproof.levelgen.identity.keys import key_of_seed
@@ -55,9 +55,7 @@ class LearnerEpisodes(NamedTuple):
 
     level: Int[np.ndarray, " episode"]  # index of each episode's level
     levels: Level
-    action: Int8[np.ndarray, "256 6 episode"]
-    steps: Int[np.ndarray, " episode"]
-    solved: Bool[np.ndarray, " episode"]
+    attempts: FirstAttempts
 
 
 def teach(
@@ -93,9 +91,8 @@ def play(
     count = len(taught.level_ids)
     chosen, _ = EpochOrder(count, min(count, config.episodes), config.seed).items(number)
     levels, ids = take(taught.levels, chosen), taught.level_ids[chosen].astype(np.int32)
-    action = first_actions(play_sampled(network), learner, levels, ids, seed, taught.rules)
-    whole: Any = jax.device_get(visit(levels, action, np.zeros(len(ids), np.int32), taught.rules))
-    return LearnerEpisodes(chosen, levels, action, whole.steps, whole.solved)
+    attempts = first_attempts(play_sampled(network), learner, levels, ids, seed, taught.rules)
+    return LearnerEpisodes(chosen, levels, attempts)
 
 
 def ask(
@@ -108,11 +105,12 @@ def ask(
     key: Key[Array, ""],
 ) -> Taught:
     """Ask the teachers about states of the learner's episodes; `rng` and `key` are consumed."""
-    episode, at = draw_states(rng, played.steps, played.solved, config.states, config.failed)
+    action, steps, solved = played.attempts
+    episode, at = draw_states(rng, steps, solved, config.states, config.failed)
     parts = []
     for some in blocks(len(at), AT_ONCE):
-        of_block = take(played.levels, episode[some]), played.action[..., episode[some]], at[some]
-        parts.append(jax.device_get(visit(*of_block, taught.rules)).now)
+        of_block = take(played.levels, episode[some]), action[..., episode[some]], at[some]
+        parts.append(jax.device_get(state_at(*of_block, taught.rules)))
     states = take(jax.tree.map(lambda *xs: np.concatenate(xs, -1), *parts), np.arange(len(at)))
     level = played.level[episode]
     asked = Asked(take(played.levels, episode), states, taught.witness_of(level))
@@ -144,11 +142,11 @@ def numbers_of(played: LearnerEpisodes, asked: Taught | None) -> dict[str, float
     labelled = length > 0
     mean = lambda x: float(x.mean()) if len(x) else np.nan
     return {
-        "distill/solve_rate": float(played.solved.mean()),
+        "distill/solve_rate": float(played.attempts.solved.mean()),
         "distill/asked": len(length),
         **by,
         "distill/none": int((~labelled).sum()),
         "distill/labelled": mean(labelled),
         "distill/steps_to_goal": mean(length[labelled]),
-        "distill/env_steps": int(played.steps.sum()) + (asked.labels.env_steps if asked else 0),
+        "distill/env_steps": int(played.attempts.env_steps.sum()) + (asked.labels.env_steps if asked else 0),
     }

@@ -108,9 +108,11 @@ def test_stored_actions_solve_their_level(levels: Level, played: evaluation.Firs
     assert (again.solved & ~still.solved).any()  # the actions matter
 
 
-def test_first_actions_are_those_of_the_first_attempts(levels: Level, played: evaluation.FirstEpisodes) -> None:
-    actions = evaluation.first_actions(play_randomly, (), levels, IDS, 1, DEFAULT_RULES)
-    record = replay(levels, actions)
+def test_first_attempts_are_those_of_all_attempts(levels: Level, played: evaluation.FirstEpisodes) -> None:
+    first = evaluation.first_attempts(play_randomly, (), levels, IDS, 1, DEFAULT_RULES)
+    np.testing.assert_array_equal(first.solved, played.solved[:, 0])
+    np.testing.assert_array_equal(first.env_steps, played.env_steps[:, 0])
+    record = replay(levels, first.action)
     ends = np.argmax(record.done, 0)
     np.testing.assert_array_equal(record.goal[ends, np.arange(len(IDS))], played.solved[:, 0])
     np.testing.assert_array_equal(ends[record.done.any(0)] + 1, played.env_steps[record.done.any(0), 0])

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from levelproof.experts.evaluation import first_actions, play_sampled
+from levelproof.experts.evaluation import first_attempts, play_sampled
 from levelproof.experts.networks.saved import Policy
 from levelproof.experts.witness.witness import Record, replay
 from levelproof.levelgen.batching import blocks, take
@@ -37,7 +37,7 @@ class Contender:
         """Play at most `lanes` levels, as `levelproof evaluate` with this seed does in its first sampled attempts."""
         (padded,) = blocks(len(level_ids), self._lanes)
         chosen = take(levels, padded), level_ids[padded]
-        actions = first_actions(self._player, self.policy.params, *chosen, seed, rules)
+        actions = first_attempts(self._player, self.policy.params, *chosen, seed, rules).action
         record = replay(levels, actions[..., : len(level_ids)], rules)
         return [_attempt(jax.tree.map(lambda x, lane=lane: x[..., lane], record)) for lane in range(len(level_ids))]
 

@@ -21,10 +21,11 @@ from levelproof.experts.generalist.teachers import (
     no_experts,
     replay_from,
 )
-from levelproof.experts.generalist.visited import draw_states, visit
+from levelproof.experts.generalist.visited import draw_states, state_at
 from levelproof.experts.imitation import from_motion
 from levelproof.experts.networks.over_levels import NetworkConfig
 from levelproof.experts.policy import forward, initial, network_of, sample
+from levelproof.experts.witness.witness import replay
 from levelproof.levelgen.level import ACTIONS, Level, Role
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task import rules as task
@@ -50,7 +51,7 @@ def asked(levels: Level) -> Asked:
     """Return states in the middle of episodes of held random actions, which are the witnesses, too."""
     action = np.random.default_rng(0).integers(0, 2, (RECORD_STEPS // 16, ACTIONS, COUNT)).astype(np.int8)
     action = np.repeat(action, 16, 0)
-    now = jax.device_get(visit(levels, action, AT, DEFAULT_RULES)).now
+    now = jax.device_get(state_at(levels, action, AT, DEFAULT_RULES))
     assert (now.timestep == AT).all()
     return Asked(levels, now, action)
 
@@ -131,12 +132,14 @@ def test_level_without_a_goal_has_no_label(asked: Asked, labels: Labels) -> None
 
 
 def test_witness_labels_its_own_first_state(asked: Asked, levels: Level) -> None:
-    solved = jax.device_get(visit(levels, asked.witness, AT * 0, DEFAULT_RULES))
+    record = replay(levels, asked.witness)
+    ends = record.done.argmax(0)
+    solved = record.goal[ends, np.arange(COUNT)]
     start = jax.device_get(task.reset(levels))
     labels = labelled(asked._replace(now=start), replace(SEARCH, random=0))
-    assert solved.solved.any()
-    assert (labels.teacher[solved.solved] == Teacher.WITNESS).all()
-    assert (labels.length[solved.solved] <= solved.steps[solved.solved]).all()
+    assert solved.any()
+    assert (labels.teacher[solved] == Teacher.WITNESS).all()
+    assert (labels.length[solved] <= ends[solved] + 1).all()
 
 
 def test_first_variation_of_a_witness_is_the_witness() -> None:
