@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from levelproof.levelgen.task.rules import MAX_REWARD_SCALE, TaskParams
 from levelproof.physics.bounds import require
 
-CHUNK = 256  # what lanes, samples and measured levels are multiples of, or fewer; a CPU cuts them further
+CHUNK = 256  # lanes and samples of a core are multiples of it, or fewer; measured levels are padded to one
 
 MAX_REPEAT = 256  # env steps; an episode of the default rules is then one action
 
@@ -90,7 +90,7 @@ class PPOConfig:
                 f"environments is {self.environments}: with {cores} core{'s' * (cores != 1)} it must be a multiple of "
                 f"{cores if self.environments < cores * CHUNK else cores * CHUNK}"
             )
-        some = max(int(lanes * self.subsample), 1)
+        some = max(int(round(lanes * self.subsample, 6)), 1)
         some -= some % min(some, CHUNK)
         if (chunks := some // min(some, CHUNK) * self.horizon) % self.minibatches:
             raise ValueError(

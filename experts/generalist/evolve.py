@@ -74,7 +74,7 @@ def _breed(
     now: Population,
     rng: np.random.Generator,
 ) -> Population:
-    """Add a generation of children to the buffer, in numpy on the host, unless too many of the last one still wait."""
+    """Add a generation of children to the buffer, from the host, unless too many of the last one still wait."""
     buffer: ReplayBuffer = jax.tree.map(np.asarray, now.buffer)
     capacity = replaying.capacity
     room = capacity - replaying.enough - waiting(buffer).sum()

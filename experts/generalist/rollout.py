@@ -18,7 +18,6 @@ from levelproof.levelgen.sampling.sampler import Sampler, sampler
 from levelproof.levelgen.task import environment
 from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.environment import EnvParams
-from levelproof.levelgen.task.fresh import renewed
 from levelproof.levelgen.task.lanes import Lanes, LaneState, LevelTable, Table
 from levelproof.levelgen.task.observe.kinds import ObservationType
 from levelproof.levelgen.task.rules import TaskParams
@@ -61,9 +60,9 @@ class Experience(NamedTuple):
 
 
 def lanes_of(size: Size, rules: TaskParams) -> Lanes:
-    """Return the environment in lanes; the caller starts the next episodes, in levels of any table."""
+    """Return the environment in lanes, for levels of any table."""
     unused = ObservationType.SYMBOLIC_ENTITY  # never computed: networks see for themselves
-    return Lanes(environment.make(sampler(size), observation_type=unused, rules=rules, auto_reset=False)[0])
+    return Lanes(environment.make(sampler(size), observation_type=unused, rules=rules)[0])
 
 
 def table_of(levels: Level | Sampler, rules: TaskParams) -> Table:
@@ -116,12 +115,9 @@ def rollout(
         live = action_mask(now.played.level)
         action = jnp.where(live, sample(logits, jax.random.uniform(of_action, (ACTIONS, count))), 0)
         log_before = log_probability(logits, action, live)
-        coming = draw(of_level, count)
-        _, after, _, reward, done, info = lanes.step(table, now.played, now.state, action, coming)
+        _, state, played, reward, done, info = lanes.step(table, now.played, now.state, action, draw(of_level, count))
         gained, expected = now.gained + reward, now.expected + now.gained + value
-        ended = Ended(done, info["GoalR"], after.now.timestep, gained, expected, info["level_index"])
-        restart = lambda ids: lanes.reset(table, ids)[1:]
-        state, played = renewed(done, coming, restart, (after, now.played))
+        ended = Ended(done, info["GoalR"], now.state.now.timestep + 1, gained, expected, info["level_index"])
         sample_of_step = Experience(observation, live, action, log_before, value, reward, done, info["terminated"])
         left = (jnp.where(done, 0.0, total) for total in (gained, expected))
         return Playing(state, played, *left), (sample_of_step, ended)
