@@ -153,8 +153,8 @@ def levels_for(split: Path, config: DistillConfig, tell: Callable[[str], None]) 
         only = "demonstrations need them" if config.demonstrations else "no other teacher is asked"
         remedy = "demonstrations=0 and states above 0" if config.demonstrations else "teachers.random above 0"
         raise UserError(
-            f"{split} has no kept experts of these levels, and {only}: set {remedy}, or make a split in a folder of "
-            "this machine with keep_experts=true."
+            f"{split} has no kept experts of these levels, and {only}: set {remedy}, or make a split on this "
+            "machine with keep_experts=true."
         )
     return ChosenLevels(data, chosen, facts, experts)
 

@@ -107,7 +107,10 @@ def _print_all(facts: Sequence[dict[str, Any]], attempts: int) -> None:
         _print(group, attempts, Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else WIDE))
     print("In brackets: 95% intervals over levels.")
     if any(group["published"] for group in facts):
-        print("sfl-paper, sfl-1m-envs: the reference's agents, with the rates that it published.")
+        print(
+            "sfl-paper (18 billion env steps on random l), sfl-1m-envs (376 billion on random m): the reference's "
+            "agents, with the rates that it published."
+        )
 
 
 def _require_sizes(contestants: Sequence["_Contestant"], groups: Sequence[MeasuredLevels]) -> None:
@@ -169,18 +172,17 @@ class _Contestant(NamedTuple):
     main: str  # name of the player that looks and comparisons are about
     entrants: dict[str, _Entrant]  # by the name that the table shows
     policy: Policy | None = None
-    agent: Agent | None = None
 
     @property
     def looks(self) -> Path:
         """Path of its log of looks at sealed levels."""
-        return self.path.with_suffix(f".{LOOKS}") if self.agent else self.path / LOOKS
+        return self.path / LOOKS if self.policy else self.path.with_suffix(f".{LOOKS}")
 
 
 def _contestant(path: Path, title: str) -> _Contestant:
     if path.suffix == AGENT_SUFFIX:
-        name, agent = AGENT if title == POLICY else title, agent_in(path)
-        return _Contestant(path, name, {name: _Entrant(agent)}, agent=agent)
+        name = AGENT if title == POLICY else title
+        return _Contestant(path, name, {name: _Entrant(agent_in(path))})
     policy = policy_at(path)
     sampled = _Entrant(play_sampled(policy.network), policy.params)
     greedy = _Entrant(play_most_probable(policy.network), policy.params, chance=False)
@@ -191,7 +193,7 @@ def _contestant(path: Path, title: str) -> _Contestant:
 def _log(one: _Contestant, looked_at: Sequence[dict[str, Any]], attempts: int, seed: int, console: Console) -> None:
     """Log a look at sealed levels beside the policy, and tell the user."""
     if looks := log_look(one.looks, one.main, looked_at, attempts, seed):
-        say(console, f"Look {looks} at the sealed levels; {one.looks} lists every look with this policy.")
+        say(console, f"This is look {looks} at the sealed levels with this policy: {one.looks} lists them all.")
     elif not str(one.path).startswith(BUILTIN):  # those that come with levelproof were chosen before this look
         say(console, f"Cannot write {one.looks}, so this look at the sealed levels is not recorded.")
 
@@ -283,7 +285,8 @@ def _print(facts: dict[str, Any], attempts: int, console: Console) -> None:
         console.print(table)
         if apart := facts.get("difference", {}).get(title):
             low, high = (f"{100 * x:+.1f}" for x in apart["interval"])
-            say_difference = f"policy minus other, one attempt, level by level: {100 * apart['rate']:+.1f} points"
+            ours = AGENT if AGENT in players else POLICY
+            say_difference = f"{ours} minus other, one attempt, level by level: {100 * apart['rate']:+.1f} points"
             console.print(f"{say_difference} ({low} to {high})")
         console.print()
 

@@ -66,7 +66,7 @@ def _require_enough(config: TrainConfig, starts: int) -> None:
     if config.choice == "replay" and starts < needed:
         raise UserError(
             f"choice=replay starts once {needed:,} levels have been attempted (replay.full_enough times "
-            f"replay.capacity), but {config.levels} gives {starts:,}: set a smaller replay.capacity."
+            f"replay.capacity), but {config.levels} has only {starts:,}: set a smaller replay.capacity."
         )
 
 
