@@ -10,12 +10,11 @@ from levelproof.experts.labels import Label
 from levelproof.experts.pool.run import UnitResult
 from levelproof.pipeline.jobs.schedule import WorkUnit, plan_units
 from levelproof.pipeline.jobs.unit import commit
-from levelproof.pipeline.store.fields import same_bits
 from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.manifest import Manifest, read_manifest, require_manifest
 from levelproof.pipeline.store.shard import Shard
 from levelproof.pipeline.store.split import writing
-from tests.pipeline.made import made_job, made_result
+from tests.pipeline.made import assert_same, made_job, made_result
 
 LEVELS, UNIT = 6, 2
 SPLIT = Path("128k/s")  # below OUT
@@ -54,7 +53,7 @@ def require_same_content(split: Path, other: Path) -> Manifest:
         assert row | {"shard": bool(row["shard"]), "row": 0} == twin | {"shard": bool(twin["shard"]), "row": 0}
         if row["shard"]:
             one, two = (Shard(at / r["shard"]).read([r["row"]]) for at, r in ((split, row), (other, twin)))
-            assert all(same_bits(one[name], two[name]).all() for name in two)
+            assert_same(one, two)
     return manifests[0]
 
 

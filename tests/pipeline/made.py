@@ -33,6 +33,7 @@ from levelproof.pipeline.store.fields import arrays_of, same_bits, tree_of
 from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.layout import split_path
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
+from levelproof.pipeline.store.shard import Shard
 
 T = TypeVar("T")
 PLAYED = 64  # levels of `played_split`
@@ -192,6 +193,21 @@ def lasting(split: Path) -> list[dict[str, Any]]:
     """Return the reproducible part of the rows: no columns about the run, and only whether there is data."""
     rows = read_manifest(split).table.to_pylist()
     return [{k: v for k, v in row.items() if k not in OF_THE_RUN} | {"data": bool(row["shard"])} for row in rows]
+
+
+def assert_same_content(split: Path, other: Path) -> None:
+    """Check that two splits have the same reproducible rows, and the same data of every level that has any."""
+    assert repr(lasting(split)) == repr(lasting(other))
+    ours, theirs = _data_of(split), _data_of(other)
+    assert ours.keys() == theirs.keys()
+    for level_id, fields in ours.items():
+        assert_same(fields, theirs[level_id])
+
+
+def _data_of(split: Path) -> dict[int, dict[str, np.ndarray]]:
+    """Return the fields of every level that has data, by id."""
+    rows = read_manifest(split).table.to_pylist()
+    return {row["level_id"]: Shard(split / row["shard"]).read([row["row"]]) for row in rows if row["shard"]}
 
 
 def made_split(folder: Path, units: Sequence[Sequence[Label]], *words: str) -> Path:

@@ -12,11 +12,11 @@ from levelproof.pipeline.look.query import RowQuery
 from levelproof.pipeline.look.show import show
 from levelproof.pipeline.look.status import read_status
 from levelproof.pipeline.store.columns import OF_THE_RUN
-from levelproof.pipeline.store.fields import same_bits
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.shard import Shard
 from levelproof.pipeline.verify.verify import examine
 from tests.pipeline.command import assert_refused, here
+from tests.pipeline.made import assert_same
 
 SIZE = "5-3-2-2"
 SPLIT = f"data/5k/{SIZE}"
@@ -83,7 +83,7 @@ def test_command_of_a_row_reproduces_the_row(made: Path) -> None:
         Shard(path / r["shard"]).read([r["row"]])
         for path, r in ((made / SPLIT, row), (made / "again" / "5k" / SIZE, again))
     )
-    assert all(same_bits(values, two[name]).all() for name, values in one.items())
+    assert_same(one, two)
 
 
 def test_generate_rejects_another_distribution_in_the_same_folder(made: Path) -> None:

@@ -11,13 +11,11 @@ import pytest
 
 from levelproof.pipeline.stopping import LAST
 from levelproof.pipeline.store.event_files import events_of, runs_in
-from levelproof.pipeline.store.fields import same_bits
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
-from levelproof.pipeline.store.shard import Shard
 from tests.pace import patience, wait_until
 from tests.pipeline.command import ROOT, descendants, heed_ctrl_c, here, listening, run, start, status, title, until
 from tests.pipeline.jobs.test_log import tensorboard_file
-from tests.pipeline.made import lasting
+from tests.pipeline.made import assert_same_content
 
 LEVELS = 16  # enough that a run is still active when it is killed after its first unit
 COMMAND = ["generate", f"levels={LEVELS}", "unit=1", "budget=5k"]
@@ -46,20 +44,8 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / SPLIT
 
 
-def content(split: Path) -> tuple[str, dict[int, dict]]:
-    """Return the reproducible part of the rows, and the stored fields of every solved level."""
-    manifest = read_manifest(split)
-    rows = manifest.table.to_pylist()
-    fields = {row["level_id"]: Shard(split / row["shard"]).read([row["row"]]) for row in rows if row["shard"]}
-    return repr(lasting(split)), fields
-
-
-def assert_same_content(split: Path, other: Path) -> None:
-    (rows, fields), (other_rows, other_fields) = content(split), content(other)
-    assert rows == other_rows
-    assert fields.keys() == other_fields.keys()
-    for level_id, arrays in fields.items():
-        assert all(same_bits(values, other_fields[level_id][name]).all() for name, values in arrays.items())
+def assert_same_split(split: Path, other: Path) -> None:
+    assert_same_content(split, other)
     assert {f"shards/{path.name}" for path in (split / "shards").iterdir()} == read_manifest(split).shards
 
 
@@ -84,14 +70,14 @@ def test_number_of_workers_changes_no_result(undisturbed: Path, tmp_path: Path) 
     done = run([*COMMAND, "executor=ray"], tmp_path)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
-    assert_same_content(tmp_path / SPLIT, undisturbed)
+    assert_same_split(tmp_path / SPLIT, undisturbed)
 
 
 @pytest.mark.campaign
 def test_unit_size_changes_no_result(undisturbed: Path, tmp_path: Path) -> None:
     assert run(["generate", "levels=1", "first_level=2", "budget=5k", "executor=inline"], tmp_path).returncode == 0
     assert run(["generate", f"levels={LEVELS}", "unit=16", "budget=5k", "executor=inline"], tmp_path).returncode == 0
-    assert_same_content(tmp_path / SPLIT, undisturbed)
+    assert_same_split(tmp_path / SPLIT, undisturbed)
 
 
 @pytest.mark.parametrize("executor", ["inline", pytest.param("ray", marks=pytest.mark.campaign)])
@@ -106,7 +92,7 @@ def test_command_killed_by_sigkill_continues_to_the_same_bits(undisturbed: Path,
     done = here([*COMMAND, "executor=inline"], tmp_path)
     assert done.returncode == 0, done.stderr
     assert "are already there" in done.stderr
-    assert_same_content(tmp_path / SPLIT, undisturbed)
+    assert_same_split(tmp_path / SPLIT, undisturbed)
 
 
 @pytest.mark.campaign
@@ -136,7 +122,7 @@ def test_run_with_a_killed_worker_stops_and_continues_to_the_same_bits(
     assert_all_gone(family)
     done = here([*COMMAND, "executor=inline"], tmp_path)
     assert done.returncode == 0, done.stderr
-    assert_same_content(tmp_path / SPLIT, undisturbed)
+    assert_same_split(tmp_path / SPLIT, undisturbed)
     assert not (tmp_path / SPLIT / "quarantine").exists()
 
 

@@ -15,12 +15,11 @@ from levelproof.experts.search.config import SearchConfig
 from levelproof.pipeline.jobs import worker as worker_module
 from levelproof.pipeline.jobs.schedule import Order, Round, UnitOutcome, WorkUnit
 from levelproof.pipeline.jobs.worker import Worker
-from levelproof.pipeline.store.fields import same_bits
 from levelproof.pipeline.store.layout import checkpoint_path
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.paused import load_paused, prune_paused
 from levelproof.pipeline.store.shard import Shard
-from tests.pipeline.made import lasting, made_job
+from tests.pipeline.made import assert_same, lasting, made_job
 
 UNITS = [WorkUnit((0, 1, 2)), WorkUnit((3,)), WorkUnit((4, 5))]
 
@@ -106,7 +105,7 @@ def test_unit_has_the_same_rows_and_bits_beside_others_and_alone(tmp_path: Path,
         if one["shard"]:
             a = Shard(tmp_path / "beside" / one["shard"]).read([one["row"]])
             b = Shard(tmp_path / "alone" / two["shard"]).read([two["row"]])
-            assert all(same_bits(values, b[name]).all() for name, values in a.items())
+            assert_same(a, b)
 
 
 def test_other_worker_makes_returned_and_undecided_levels_to_the_same_bits(tmp_path: Path, job: JobConfig) -> None:

@@ -121,21 +121,6 @@ def test_folder_holds_a_policy_with_its_origin(policy: Path, split: Path) -> Non
 
 
 @pytest.mark.slow
-def test_run_that_was_stopped_continues_bit_for_bit(
-    policy: Path, split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stop_after_saving(monkeypatch, module)
-    here(["distill", str(split), "-o", "policy", *ROUNDS, *TEACHERS, *TINY], tmp_path)
-    assert load_file(tmp_path / "policy/checkpoint.safetensors")[".imitation.updates"] == 2
-    monkeypatch.undo()
-    out = distilled(tmp_path, split, *TINY)
-    for name in FILES:
-        assert (out / name).read_bytes() == (policy / name).read_bytes()
-    mine, theirs = (metrics(folder)[-1] | {"distill/core_seconds": 0.0} for folder in (out, policy))
-    assert mine == theirs
-
-
-@pytest.mark.slow
 def test_start_gives_weights_and_network(
     policy: Path, split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -213,7 +198,9 @@ def test_experts_that_a_split_kept_are_those_of_their_levels(
     rows = [{"level_id": i, "size": "s", "experts": name if i in (1, 3) else None} for i in ids.tolist()]
     manifest = kept_experts.require_manifest(split, ["experts", "size"], ids)
     table = manifest.table.from_pylist(rows)
-    monkeypatch.setattr(kept_experts, "require_manifest", lambda *_: _With(table, manifest.config))
+    monkeypatch.setattr(
+        kept_experts, "require_manifest", lambda *_: SimpleNamespace(table=table, config=manifest.config)
+    )
     monkeypatch.setattr(kept_experts, "data_path", lambda *_: tmp_path / "experts.npz")
     known = experts_of(split, ids)
     assert known.config == job.expert
@@ -233,16 +220,9 @@ def test_experts_whose_updates_need_a_larger_budget_are_read(
     table = kept_experts.require_manifest(split, ["experts", "size"], ids).table.from_pylist(
         [{"level_id": 0, "size": "s", "experts": f"{EXPERTS}/000000000000-000000000000-0123456789abcdef.npz"}]
     )
-    monkeypatch.setattr(kept_experts, "require_manifest", lambda *_: _With(table, job.results))
+    monkeypatch.setattr(kept_experts, "require_manifest", lambda *_: SimpleNamespace(table=table, config=job.results))
     monkeypatch.setattr(kept_experts, "data_path", lambda *_: tmp_path / "experts.npz")
     assert experts_of(split, ids).config == job.expert
-
-
-class _With:
-    """A manifest of this table."""
-
-    def __init__(self, table: Any, config: Any) -> None:
-        self.table, self.config = table, config
 
 
 def test_levels_are_witnessed_and_neither_trivial_nor_sealed(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,24 +14,23 @@ import pytest
 
 import levelproof
 from benchmarks.published import write as write_published
-from levelproof.experts.evaluation import do_nothing, play
+from levelproof.experts.evaluation import do_nothing, play, play_most_probable, play_sampled
 from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy
 from levelproof.experts.networks.saved import Policy, save_policy
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.files.kinetix import state_to_kinetix
 from levelproof.levelgen.files.level_file import LevelFile, write_level_file
-from levelproof.levelgen.level import SIZES, size_of
+from levelproof.levelgen.level import size_of
 from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.exchange.level_json import export
-from levelproof.pipeline.learn import published
+from levelproof.pipeline.learn import evaluate, published
 from levelproof.pipeline.learn.looks import LOOKS, log_look
 from levelproof.pipeline.learn.measured import levels_in, midway_levels
-from levelproof.pipeline.learn.sealed import SEALED, known_sealed
-from levelproof.pipeline.learn.solve_rates import difference, interval, solve_rates
-from levelproof.pipeline.learn.specialists import sealed_specialists, specialists_of
+from levelproof.pipeline.learn.sealed import SEALED
+from levelproof.pipeline.learn.specialists import specialists_of
 from levelproof.pipeline.read.agents import agent_in
 from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.manifest import read_manifest
@@ -185,7 +184,7 @@ def test_policies_are_compared_on_the_same_levels_and_both_looks_are_logged(tmp_
             f"{split}, s": {"levels": 16, "solved": same["of"]["sealed"]["agent"]["once"]["rate"]}
         }
     done = here(["evaluate", "one.py", "--against", "three.py", "--levels", "32", "--attempts", "2"], tmp_path)
-    assert re.search(r"policy minus other, one attempt, level by level: [+-]\d+\.\d points \([+-]", done.stdout)
+    assert re.search(r"agent minus other, one attempt, level by level: [+-]\d+\.\d points \([+-]", done.stdout)
     assert (tmp_path / f"three.{LOOKS}").read_text().count("\n") == 1
 
 
@@ -234,99 +233,12 @@ def test_command_refuses_a_policy_of_another_size(tmp_path: Path) -> None:
     assert_refused(here(["evaluate", str(policy), "--levels", "8"], tmp_path), 2, "plays levels of size m only")
 
 
-def test_intervals_are_over_levels() -> None:
-    once = np.arange(100)[:, None] < 40
-    assert np.allclose(interval(once), (0.3094, 0.4980), atol=1e-4)  # Wilson's, from a table
-    same = np.repeat(once, 8, axis=1)  # attempts that tell nothing new narrow nothing
-    assert np.allclose(interval(same), interval(once), atol=0.01)
-
-
-@pytest.mark.parametrize(("share", "levels"), [(0.02, 30), (0.98, 30), (0.05, 10), (0.4, 100)])
-def test_intervals_hold_the_rate_as_often_as_they_say(share: float, levels: int) -> None:
-    """Sample levels of which `share` are always solved and the others never."""
-    rng = np.random.default_rng(0)
-    drawn = np.repeat(rng.random((500, levels, 1)) < share, 4, axis=2)
-    held = [low <= share <= high for low, high in map(interval, drawn)]
-    assert np.mean(held) > 0.93
-
-
-def test_interval_of_levels_that_are_alike_contains_their_rate() -> None:
-    low, high = interval(np.tile([True, False], (20, 4)))
-    assert low < 0.5 < high
-
-
-def test_worst_tenth_is_rated_on_other_attempts_than_chose_it() -> None:
-    """If all levels are alike, the worst tenth is as good as the rest."""
-    solved = np.random.default_rng(0).random((4000, 8)) < 0.5
-    assert abs(solve_rates(solved, None)["worst"]["rate"] - 0.5) < 0.04
-    assert solved[np.argsort(solved.mean(1))[:400]].mean() < 0.25
-
-
-def test_worst_tenth_has_all_levels_that_tie_with_its_last() -> None:
-    """Of levels that nothing tells apart, which come first does not matter."""
-    hopeless = np.zeros((300, 4), bool)
-    chosen = np.tile([False, False, True, True], (100, 1))  # not solved by the attempts that choose
-    easy = np.ones((600, 4), bool)
-    for levels in (hopeless, chosen, easy), (easy, chosen, hopeless):
-        worst = solve_rates(np.concatenate(levels), None)["worst"]
-        assert (worst["rate"], worst["levels"]) == (0.25, 400)
-    assert solve_rates(np.concatenate([hopeless[:10], easy[:90]]), None)["worst"]["levels"] == 10
-
-
-def test_difference_is_over_levels_and_narrower_than_the_players_intervals() -> None:
-    rng = np.random.default_rng(0)
-    skill = rng.random((2000, 1)) < 0.5  # whether anyone solves the level
-    ours, theirs = ((rng.random((2000, 8)) < share) & skill for share in (0.9, 0.85))
-    apart = difference(ours, theirs)
-    low, high = apart["interval"]
-    assert abs(apart["rate"] - 0.025) < 0.01
-    assert 0 < low < apart["rate"] < high
-    assert high - low < 0.5 * (interval(ours)[1] - interval(ours)[0])
-    assert difference(theirs, ours)["interval"] == [-high, -low]
-    few = difference(np.ones((4, 8), bool), np.zeros((4, 8), bool))
-    assert few["interval"][0] < 0.6, "four levels tell little"
-
-
-@pytest.mark.parametrize(("ours", "theirs"), [(0.5, 0.5), (0.9, 0.7), (0.1, 0.15)])
-def test_intervals_of_differences_hold_the_difference_as_often_as_they_say(ours: float, theirs: float) -> None:
-    rng = np.random.default_rng(0)
-    held = []
-    for _ in range(400):
-        skill = rng.random((60, 1))
-        pair = [rng.random((60, 4)) < np.clip(2 * skill * share, 0, 1) for share in (ours, theirs)]
-        expected = np.clip(2 * np.linspace(0, 1, 10001) * ours, 0, 1).mean()
-        expected -= np.clip(2 * np.linspace(0, 1, 10001) * theirs, 0, 1).mean()
-        low, high = difference(*pair)["interval"]
-        held.append(low <= expected <= high)
-    assert np.mean(held) > 0.93
-
-
-def test_steps_are_those_of_attempts_that_reach_the_goal() -> None:
-    steps = np.array([[10, 256], [30, 256]])
-    assert solve_rates(np.array([[True, False], [True, False]]), steps)["steps"] == 20
-    assert solve_rates(np.zeros((2, 2), bool), steps)["steps"] is None
-
-
-def test_known_sealed_levels_fit_the_sealed_ids() -> None:
-    """Labels and successes have an entry for each id; experts of solved levels mostly succeed now and then."""
-    for size in SIZES:
-        known = known_sealed(size)
-        assert known is not None
-        assert known.solved.shape == (len(SEALED),)
-        names = [each.name for each in sealed_specialists(size, 64, 8)]
-        assert names == [f"its own expert, {budget}" for budget in known.successes]
-        best = [*known.successes.values()][-1]
-        assert best.shape == (len(SEALED),)
-        assert 0 <= best.min() <= best.max() == 16
-        assert np.mean(best[known.solved] > 0) > 0.7
-
-
 def test_each_look_at_the_sealed_levels_is_logged(tmp_path: Path) -> None:
     policy = policy_in(tmp_path, PolicyKind.FLAT, "s")  # compiles fastest
     for look in (1, 2):
         done = here(["evaluate", str(policy), "--levels", "4", *ONCE], tmp_path)
         assert done.returncode == 0, done.stderr
-        assert f"Look {look} at the sealed levels" in done.stderr
+        assert f"look {look} at the sealed levels" in done.stderr
     looks = [json.loads(line) for line in (policy / LOOKS).read_text().splitlines()]
     assert [look["on"]["sealed s"]["levels"] for look in looks] == [4, 4]
     assert {look["attempts"] for look in looks} == {1}
@@ -432,3 +344,12 @@ def test_random_levels_of_the_reference_are_hardly_solved_by_doing_nothing(refer
     played = play(do_nothing, (), group.levels, group.level_ids, 1, 0, group.rules)
     assert len(group.level_ids) == 512
     assert (played.solved & (played.env_steps <= 64)).mean() < 0.01
+
+
+def test_rows_of_a_policy_are_named_by_how_it_plays() -> None:
+    one = evaluate._contestant(Path("builtin:s"), "policy")
+    assert one.policy
+    players = play_sampled(one.policy.network), play_most_probable(one.policy.network)
+    assert [*one.entrants] == [one.main, "policy, greedy"] == ["policy, sampled", "policy, greedy"]
+    assert tuple(entrant.player for entrant in one.entrants.values()) == players
+    assert [entrant.chance for entrant in one.entrants.values()] == [True, False]

@@ -7,7 +7,7 @@ import pytest
 
 from levelproof.levelgen.level import SIZES
 from levelproof.pipeline.learn.sealed import SEALED, known_sealed
-from levelproof.pipeline.learn.specialists import successes_of
+from levelproof.pipeline.learn.specialists import sealed_specialists, successes_of
 from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.command import here
 
@@ -33,3 +33,17 @@ def test_known_sealed_levels_are_what_a_job_makes_of_them(size: str, tmp_path: P
     assert size == "l" or (successes != expected).sum() <= 4
     assert np.abs(successes - expected).mean() <= 0.5
     assert np.abs(successes - np.roll(expected, 1)).mean() > 2, "other levels would show"
+
+
+def test_known_sealed_levels_fit_the_sealed_ids() -> None:
+    """Labels and successes have an entry for each id; experts of solved levels mostly succeed now and then."""
+    for size in SIZES:
+        known = known_sealed(size)
+        assert known is not None
+        assert known.solved.shape == (len(SEALED),)
+        names = [each.name for each in sealed_specialists(size, 64, 8)]
+        assert names == [f"its own expert, {budget}" for budget in known.successes]
+        best = [*known.successes.values()][-1]
+        assert best.shape == (len(SEALED),)
+        assert 0 <= best.min() <= best.max() == 16
+        assert np.mean(best[known.solved] > 0) > 0.7
