@@ -9,8 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from benchmarks.cloning import GREEDY, SAMPLED, command, interval_text, kept
-from benchmarks.learners import SECONDS, STEPS, lines_of, slug
+from benchmarks.cloning import GREEDY, SAMPLED, command, interval_text, kept, lines_of, slug
+from benchmarks.equal import SECONDS, STEPS
 from benchmarks.report import Report, Table
 from levelproof.configs.numbers import parse_count
 from levelproof.levelgen.level import SIZES
@@ -18,10 +18,10 @@ from levelproof.pipeline.learn.evaluate import ALL
 from levelproof.pipeline.learn.published import HANDMADE, HANDMADE_LEVELS, PROTOCOLS, handmade_folder
 from levelproof.pipeline.runtime import own_cores
 
-LARGE = ("ppo.environments=1024", "ppo.epochs=2", "ppo.repeat=1", "ppo.gae_lambda=0.97", "ppo.subsample=1")
+FEW = ("ppo.environments=512",)  # lanes: more updates in as many env steps
 WAYS = {  # name: settings of `levelproof train`
-    "tuned": (*LARGE, "ppo.learning_rate=2e-4", "ppo.entropy_weight=0.002", "ppo.critic_updates=5"),
-    "from scratch": (*LARGE, "ppo.learning_rate=3e-4", "ppo.entropy_weight=0.005", "network.width=64"),
+    "tuned": (*FEW, "ppo.learning_rate=5e-4", "ppo.critic_updates=2"),
+    "from scratch": (*FEW, "ppo.learning_rate=5e-4", "network.width=64"),
 }
 ATTEMPTS = PROTOCOLS[HANDMADE].attempts
 
@@ -30,7 +30,7 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--start", default="builtin:s", help="policy to tune (default: builtin:s)")
     parser.add_argument("--sizes", nargs="+", choices=list(SIZES), default=list(SIZES), help="default: all")
     parser.add_argument("--seeds", type=int, default=1, help="policies of each way and size (default: 1)")
-    parser.add_argument("--env-steps", default="2M", help="env steps of each policy (default: 2M)")
+    parser.add_argument("--env-steps", default="4M", help="env steps of each policy (default: 4M)")
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of all training")
     parser.add_argument("--folder", type=Path, default=Path("tuned"), help="where policies are kept")
 
@@ -38,12 +38,14 @@ def register(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> Report:
     args.folder.mkdir(parents=True, exist_ok=True)
     levels = handmade_folder()
-    runs = [(size, way, seed) for size in args.sizes for way in WAYS for seed in range(args.seeds)]
+    runs = [(size, way, seed) for seed in range(args.seeds) for size in args.sizes for way in WAYS]
     with ThreadPoolExecutor(len(own_cores())) as threads:
         trained = [*threads.map(lambda one: measured(args, levels, *one), runs)]
     untrained = [{"size": size, "way": "not trained on them", "last": None, "rates": zero_shot(args, size)}
                  for size in args.sizes]  # fmt: skip
-    results = sorted((*untrained, *trained), key=lambda each: args.sizes.index(each["size"]))
+    ways = [each["way"] for each in (*untrained, *trained)]
+    order = lambda each: (args.sizes.index(each["size"]), ways.index(each["way"]))
+    results = sorted((*untrained, *trained), key=order)
     head = (
         "levels",
         "policy",
@@ -59,8 +61,8 @@ def run(args: argparse.Namespace) -> Report:
         results,
         [Table(head, [row_of(each) for each in results], "Share of the reference's handmade levels that are solved")],
         [
-            f"The policy that is tuned, and played as it is, is {args.start}. Policies are trained on all levels of "
-            f"one size ({', '.join(f'{size}: {HANDMADE_LEVELS[size]}' for size in args.sizes)}) and play these, "
+            f"*Not trained on them* is {args.start}; *tuned* starts from it. Training uses all levels of one size "
+            f"({', '.join(f'{size}: {HANDMADE_LEVELS[size]}' for size in args.sizes)}), and policies play these, "
             f"{ATTEMPTS} attempts each; brackets: 95% intervals over levels. One row per seed.",
             f"`levelproof train` with {settings}. Core-seconds are CPU time with compiling, those of {args.start} "
             "not included.",
