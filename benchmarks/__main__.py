@@ -57,7 +57,6 @@ BENCHMARKS = {  # name: (module, what it measures)
     "seeds": ("benchmarks.seeds", "bytes of seeds, and transitions/s read from them and from a disk"),
     "workers": ("benchmarks.workers", "how much faster two workers are than one, and what a thousand cost the driver"),
     "cloning": ("benchmarks.cloning", "how cloned policies solve unseen levels, against the number of levels"),
-    "learners": ("benchmarks.learners", "what policies trained by reinforcement learning solve, and at what cost"),
     "agents": ("benchmarks.agents", "how policies play the levels of the reference's published agents"),
     "cold": ("benchmarks.cold", "how long the first levels take with nothing compiled, and the next ones"),
     "cost": ("benchmarks.cost", "what a solved level costs, and how many are solved, beside an earlier commit"),

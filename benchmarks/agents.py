@@ -42,10 +42,10 @@ def run(args: argparse.Namespace) -> Report:
         "Shares of levels solved by sampled actions, first episode only, mean over "
         f"{PROTOCOLS[RANDOM].attempts} attempts at a random level and {PROTOCOLS[HANDMADE].attempts} at a handmade "
         "one: the protocol of the reference (kinetix-env 3.0.2), whose README has the rates of `sfl-paper` and "
-        "`sfl-1m-envs`. The reference wrote the levels; ours are played in our engine. Unsolvable levels count, too. "
+        "`sfl-1m-envs`. The levels are the reference's; our policies play in our engine. Unsolvable levels count. "
         "Brackets: 95% intervals over levels; the published rates have none.",
-        "Env steps are those that reinforcement learned from: not those in which learnability measured levels, nor "
-        "those of searches for demonstrations. `builtin:s` and `builtin:m` have neither.",
+        "Env steps are those played in training by reinforcement learning, without measurements of learnability or "
+        "searches for demonstrations; `builtin:s` and `builtin:m` used neither.",
         *(
             f"`{policy}` also learned from demonstrations, whose env steps are not counted: witnesses of up to "
             f"{count:,} levels."

@@ -9,6 +9,7 @@ import hashlib
 import itertools
 import json
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -137,6 +138,11 @@ def kept(file: Path, policy: Path | str, *words: Any) -> dict[str, Any]:
     if not file.exists():
         write(file, command("evaluate", policy, *words, "--json").encode())
     return json.loads(file.read_text())["levels"][0]["of"]
+
+
+def slug(name: str) -> str:
+    """Return a name as the files and folders of a benchmark have it."""
+    return re.sub("[ :,=]+", "-", name)
 
 
 def lines_of(policy: Path) -> list[dict[str, float]]:

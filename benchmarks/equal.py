@@ -2,13 +2,13 @@
 
 Everything that a way needs counts as its core-seconds. A stopped run resumes, except in a search: every command
 continues what it left, training from its checkpoint, and the folder keeps finished evaluations. A way takes hours, so
-the repository keeps finished ones, and other machines add theirs.
+the repository keeps finished ones, and other machines add theirs: core-seconds are those of the processor of the first
+runs, and a processor that trains from scratch at half its pace has twice as many for as much work.
 """
 
 import argparse
 import hashlib
 import json
-import re
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
@@ -17,11 +17,11 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
 
-from benchmarks.cloning import SAMPLED, command, interval_text, kept, lines_of, timed_split
-from benchmarks.learners import ATTEMPTS, RATE, SECONDS, START, STEPS, add_ways, rates_text, slug
+from benchmarks.cloning import ATTEMPTS, SAMPLED, command, interval_text, kept, lines_of, slug, timed_split
 from benchmarks.plotting import pyplot, save
 from benchmarks.report import Report, Table
 from benchmarks.teaching import DISTILLING
+from levelproof.configs.compose import compose_train
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.learn.evaluate import ALL, SOLVED
 from levelproof.pipeline.runtime import own_cores
@@ -30,19 +30,19 @@ from levelproof.pipeline.store.provenance import device
 
 FINISHED = Path(__file__).parent / "results" / "equal"  # a file for each finished run
 POINTS = 100  # of its curve
+PACE = 84_500.0  # env steps of s a core-second of training from scratch where the first runs were made (AMD EPYC)
+PACED = 15  # updates that measure a processor's pace
 LOOKS = 0.25, 0.5, 1.0  # shares of the core-seconds after which a policy is measured
 FIRST = 50_000  # id of the first level to clone from; the measured ones are sealed
 BETWEEN_SEEDS = 10_000_000  # ids
 SCRATCH = ("network.width=64",)
-ALL_SAMPLES = "ppo.gae_lambda=0.97", "ppo.subsample=1"  # learn from all of them, with longer traces of advantages
-SHORT = "ppo.repeat=1", *ALL_SAMPLES  # actions of one env step in training, too
 TUNING = ("ppo.learning_rate=2e-4", "ppo.entropy_weight=0.002", "ppo.critic_updates=5")
 PLOT = "equal.svg"
-UPDATES = "train/updates"
+UPDATES, STEPS, SECONDS, RATE = "train/updates", "train/env_steps", "train/core_seconds", "train/solve_rate"
 SETTLED = 5  # updates, after which lines no longer favour short episodes
 SHARES = "of all", "of solved", "best of 8"
 PLAYERS = "random", "sticky random", "its own expert, 256k"
-CLONE = "clone"
+CLONE, START = "clone", "builtin:s"
 
 
 class Way(NamedTuple):
@@ -60,15 +60,11 @@ class Way(NamedTuple):
         return self.own_levels or self.start == CLONE
 
 
-SEARCHING = Lock()  # several ways share levels and a clone
+SEARCHING, PACING = Lock(), Lock()  # several ways share levels, a clone and a pace
 WAYS = {
     "from scratch": Way(SCRATCH, colour="#0072b2"),
-    "from scratch, all samples": Way((*SCRATCH, *ALL_SAMPLES), colour="#6699cc"),
-    "from scratch, short actions": Way((*SCRATCH, "ppo.learning_rate=3e-4", *SHORT), colour="#99bbdd"),
     "from scratch, learnability": Way((*SCRATCH, "levels=learnability"), colour="#56b4e9"),
     "from scratch, replay": Way((*SCRATCH, "levels=replay"), colour="#117733"),
-    "from scratch, learnability, all samples": Way((*SCRATCH, "levels=learnability", *ALL_SAMPLES), colour="#aaddee"),
-    "from scratch, replay, all samples": Way((*SCRATCH, "levels=replay", *ALL_SAMPLES), colour="#88bb99"),
     "from scratch, evolve": Way((*SCRATCH, "levels=evolve"), colour="#882255"),
     "levels, reinforcement on these levels": Way(SCRATCH, colour="#000000", own_levels=True),
     "levels, clone, reinforcement": Way(TUNING, CLONE, "#d55e00"),
@@ -77,21 +73,18 @@ WAYS = {
     "levels, clone, learnability on these levels": Way(
         (*TUNING, "choice=learnability"), CLONE, "#999933", own_levels=True
     ),
-    "levels, clone, learnability on these levels, all samples": Way(
-        (*TUNING, "choice=learnability", *ALL_SAMPLES), CLONE, "#b3b366", own_levels=True
-    ),
-    "levels, clone, learnability on these levels, short actions": Way(
-        (*TUNING, "choice=learnability", *SHORT), CLONE, "#cccc88", own_levels=True
-    ),
-    "levels, clone, teachers, reinforcement on these levels": Way(
-        TUNING, CLONE, "#661100", own_levels=True, teachers=True
-    ),
+    "levels, clone, teachers, reinforcement": Way(TUNING, CLONE, "#661100", teachers=True),
     "from builtin:s": Way(TUNING, START, "#009e73"),
 }
 
 
 def register(parser: argparse.ArgumentParser) -> None:
-    add_ways(parser, WAYS, "equal")
+    parser.add_argument("--ways", nargs="+", choices=list(WAYS), default=list(WAYS), help="default: all")
+    parser.add_argument("--size", default="s", help="size of the levels (default: s)")
+    parser.add_argument("--seeds", type=int, default=1, help="policies of each way (default: 1)")
+    parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of all training")
+    parser.add_argument("--measured", type=int, default=2048, help="sealed levels to measure on (default: 2048)")
+    parser.add_argument("--folder", type=Path, default=Path("equal"), help="where everything is kept")
     parser.add_argument("--core-seconds", type=float, default=3600, help="of each policy (default: 3600)")
     parser.add_argument("--levels", default="8k", help="levels to search for a clone (default: 8k)")
     parser.add_argument("--updates", type=int, default=1500, help="updates of a clone (default: 1500)")
@@ -113,12 +106,11 @@ def run(args: argparse.Namespace) -> Report:
             results = [json.loads(file.read_text()) for file in threads.map(lambda one: finished(args, *one), runs)]
     if not results:
         raise UserError(f"--only-finished: {args.finished} has none of these runs; without it they are made.")
-    results.sort(key=lambda each: each["device"])
     players, dates = results[0]["sealed"], sorted(each["date"][:10] for each in results)
     rows = [list(row) for row in dict.fromkeys(tuple(row) for each in results for row in rows_of(each))]
-    rows += [row_of(name, ("", "", "", "", ""), players, name) for name in PLAYERS if name in players[ALL]]
+    rows += [row_of(name, ("", "", "", ""), players, name) for name in PLAYERS if name in players[ALL]]
     shown = {each["way"] for each in results}
-    head = ("policy", "seed", "processor", "env steps", "core-seconds before training", "in all", *SHARES)
+    head = ("policy", "seed", "env steps", "core-seconds before training", "in all", *SHARES)
     return Report(
         "Learners at equal cost",
         results,
@@ -128,38 +120,36 @@ def run(args: argparse.Namespace) -> Report:
         ],
         [
             f"Every policy has at most {args.core_seconds:,.0f} core-seconds of one core, with compiling, for all "
-            f"that it is made from: the search of {args.levels} levels (`procedure=label budget=16k`, ids from "
-            f"{FIRST:,} on, for the second seed from {FIRST + BETWEEN_SEEDS:,}), the clone "
-            f"({', '.join((f'{args.updates:,} updates', *(f'`{each}`' for each in (*SCRATCH, *args.cloning))))}), and "
-            "reinforcement learning for the rest, on random levels unless a way says otherwise"
+            f"that it is made from: if its row names them, the search of {args.levels} levels (`procedure=label "
+            f"budget=16k`, ids from {FIRST:,} on, for the second seed from {FIRST + BETWEEN_SEEDS:,}), the clone "
+            f"({', '.join((f'{args.updates:,} updates', *(f'`{each}`' for each in (*SCRATCH, *args.cloning))))}); then "
+            "reinforcement learning, on random levels unless its row says otherwise"
             f"{f'; what {START} took is not counted' if any(WAYS[way].start == START for way in shown) else ''}. "
-            "Compare rows of one processor: another takes more or fewer env steps in as many "
-            "core-seconds. *Of all*: "
+            f"Core-seconds are CPU seconds on a core that trains from scratch on s at {PACE:,.0f} env steps a second, "
+            f"with the code of the run; those of another pace ({paces(results)}) are converted. *Of all*: "
             f"{players[ALL]['random']['levels']:,} levels, of which some cannot be solved; *of solved*, and the best "
             f"of 8 attempts at them: the {players[SOLVED]['random']['levels']:,} that are labelled solved.",
             *dict.fromkeys(each["remark"] for each in results if "remark" in each),
             *(f"{way}: `levelproof train {words_of(args, way, 0)}{started(way)}`." for way in WAYS if way in shown),
             f"![Shares that reach the goal, in training and of sealed levels, against core-seconds]({PLOT})",
-            "On the left, episodes of training: of the weights as they act, in random levels never played before, or "
-            "in the levels that a way trains on. On the right, as in the table, the sealed levels labelled solved that "
-            "the average of the weights solves, which is what is saved; a first point is the clone. Some runs were "
-            "measured at their end alone.",
+            "Left: share of training episodes that reach the goal, by the current weights, on fresh random levels or "
+            "those that the way trains on. Right, as in the table: share of the sealed levels labelled solved that the "
+            "saved average of the weights solves; after a clone, the first point is the clone. Some runs were measured "
+            "only at their end.",
         ],
         plots={PLOT: partial(draw, results)},
-        made=f"{' to '.join(dict.fromkeys((dates[0], dates[-1])))}, on the processors in the table",
+        made=f"{' to '.join(dict.fromkeys((dates[0], dates[-1])))}, on "
+        f"{', '.join(dict.fromkeys(each['device'].removeprefix('cpu: ') for each in results))}",
     )  # fmt: skip
 
 
 def longest(args: argparse.Namespace, way: str, seed: int) -> list[dict[str, Any]]:
-    """Return the results of a way's longest finished run within the core-seconds, on every processor that has one."""
-    about, best = stem_of(args, way, seed)[1], {}
-    for file in sorted(args.finished.glob(f"{slug(way)}-{args.size}-{seed}-*.json")):
-        each = json.loads(file.read_text())
-        is_this = all(each[name] == value for name, value in about.items() if name != "core_seconds")
-        shown = best.get(each["device"])
-        if is_this and each["core_seconds"] <= args.core_seconds:
-            best[each["device"]] = max(each, shown or each, key=lambda run: run["core_seconds"])
-    return [*best.values()]
+    """Return the result of a way's longest finished run within the core-seconds, if there is one."""
+    about, files = stem_of(args, way, seed)[1], args.finished.glob(f"{slug(way)}-{args.size}-{seed}-*.json")
+    is_this = lambda each: all(each[name] == value for name, value in about.items() if name != "core_seconds")
+    runs = [each for each in (json.loads(file.read_text()) for file in files) if is_this(each)]
+    runs = [each for each in runs if each["core_seconds"] <= args.core_seconds]
+    return [max(runs, key=lambda each: each["core_seconds"])] if runs else []
 
 
 def stem_of(args: argparse.Namespace, way: str, seed: int) -> tuple[str, dict[str, Any]]:
@@ -179,9 +169,9 @@ def stem_of(args: argparse.Namespace, way: str, seed: int) -> tuple[str, dict[st
 
 
 def finished(args: argparse.Namespace, way: str, seed: int) -> Path:
-    """Return the file of a run on a processor like this, which is made if there is none: another has its own speed."""
+    """Return the file of a run, which is made if there is none."""
     stem, about = stem_of(args, way, seed)
-    file = args.finished / f"{stem}-{re.sub('[^A-Za-z0-9]+', '-', device()).strip('-')}.json"
+    file = args.finished / f"{stem}.json"
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
         made = {"device": device(), "date": datetime.now(UTC).isoformat(timespec="seconds")}
@@ -190,32 +180,53 @@ def finished(args: argparse.Namespace, way: str, seed: int) -> Path:
 
 
 def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
-    """Make one policy, and measure it and its clone on sealed levels."""
-    folder = args.folder / f"{slug(way)}-{args.size}-{seed}"
+    """Make one policy, and measure it and its clone on sealed levels; core-seconds are those of PACE."""
+    folder, here = args.folder / f"{slug(way)}-{args.size}-{seed}", pace(args)
+    scale = here / PACE  # of core-seconds
     start, before, clone = WAYS[way].start, 0.0, None
     if start == CLONE:
         with SEARCHING:
-            start, before = cloned(args, way, seed)
+            start, seconds = cloned(args, way, seed)
+            before = scale * seconds
             clone = kept(start.with_name(f"{start.name}-{args.measured}.json"), start, *measuring(args))
     elif WAYS[way].own_levels:
         with SEARCHING:
-            before = searched(args, seed)
+            before = scale * searched(args, seed)
     ends, looks, curve, rates = [share * args.core_seconds for share in LOOKS], [], [], {}
     if before >= ends[-1]:
         raise UserError(f"{way}: what comes before training takes {before:,.0f} core-seconds: raise --core-seconds.")
     for spent in (end for end in ends if end > before):
         look, so_far = folder.with_name(f"{folder.name}-after-{spent:g}-{args.measured}.json"), lines_of(folder)
-        if spent < ends[-1] and (look.exists() or (so_far and so_far[-1][SECONDS] > spent - before)):
+        limit = (spent - before) / scale  # in seconds of this processor
+        if spent < ends[-1] and (look.exists() or (so_far and so_far[-1][SECONDS] > limit)):
             looks += [json.loads(look.read_text())] if look.exists() else []
             continue  # of a run that was stopped, or had fewer core-seconds
-        curve = trained(args, folder, way, start, seed, spent - before)
+        curve = trained(args, folder, way, start, seed, limit)
         rates = kept(args.folder / f"{folder.name}-{curve[-1][STEPS]}-{args.measured}.json", folder, *measuring(args))
         solved = rates[SOLVED][SAMPLED]["once"]
-        looks.append({"planned": spent, SECONDS: before + curve[-1][SECONDS], "solved": solved})
+        looks.append({"planned": spent, SECONDS: before + scale * curve[-1][SECONDS], "solved": solved})
         write(look, (json.dumps(looks[-1]) + "\n").encode())
     lines = [*curve[:: -(-len(curve) // POINTS)], curve[-1]]
-    some = [{name: line.get(name) for name in (UPDATES, STEPS, SECONDS, RATE)} for line in lines]
-    return {"before": before, "curve": some, "looks": looks, "sealed": rates, "cloned": clone}
+    some = [
+        {name: line.get(name) for name in (UPDATES, STEPS, RATE)} | {SECONDS: scale * line[SECONDS]} for line in lines
+    ]
+    return {"pace": here, "before": before, "curve": some, "looks": looks, "sealed": rates, "cloned": clone}
+
+
+def pace(args: argparse.Namespace) -> float:
+    """Return how many env steps of s a core-second of training from scratch takes here; measured once a folder."""
+    policy, words = args.folder / "pace", ("size=s", "cores=1", *SCRATCH, "interval=5")
+    steps = PACED * compose_train(words).ppo.steps_per_update
+    with PACING:
+        command("train", *words, f"ppo.env_steps={steps}", "-o", policy)
+    first, *_, last = lines_of(policy)  # the first comes after compiling
+    return (last[STEPS] - first[STEPS]) / (last[SECONDS] - first[SECONDS])
+
+
+def paces(results: Sequence[Mapping[str, Any]]) -> str:
+    """Say which other paces the core-seconds of results were converted from."""
+    others = dict.fromkeys(f"{each['pace']:,.0f}" for each in results if "pace" in each)
+    return f"here {', '.join(others)}" if others else "here none"
 
 
 def measuring(args: argparse.Namespace) -> Sequence[Any]:
@@ -295,18 +306,13 @@ def trained(
 
 def rows_of(each: Mapping[str, Any]) -> list[list[str]]:
     """Return the rows of a policy: of its clone, if it has one, and of itself."""
-    last, rows, run = each["curve"][-1], [], run_of(each)
+    last, rows, seed = each["curve"][-1], [], str(each["seed"])
     if each["cloned"]:
-        cost = *run, "0", "", f"{each['before']:,.0f}"
+        cost = seed, "0", "", f"{each['before']:,.0f}"
         name = "levels, clone, teachers" if WAYS[each["way"]].teachers else "levels, clone"
         rows.append(row_of(name, cost, each["cloned"]))
-    cost = *run, f"{last[STEPS]:,}", f"{each['before']:,.0f}", f"{each['before'] + last[SECONDS]:,.0f}"
+    cost = seed, f"{last[STEPS]:,}", f"{each['before']:,.0f}", f"{each['before'] + last[SECONDS]:,.0f}"
     return [*rows, row_of(each["way"], cost, each["sealed"])]
-
-
-def run_of(each: Mapping[str, Any]) -> tuple[str, str]:
-    """Return a run's seed and processor."""
-    return str(each["seed"]), each["device"].removeprefix("cpu: ")
 
 
 def by_cost(results: Sequence[Mapping[str, Any]]) -> Table:
@@ -314,10 +320,10 @@ def by_cost(results: Sequence[Mapping[str, Any]]) -> Table:
     shares = [dict(after(each)) for each in results]
     costs = sorted({cost for each in shares for cost in each})
     rows = [
-        [each["way"], *run_of(each), *(interval_text(share[cost]) if cost in share else "" for cost in costs)]
+        [each["way"], str(each["seed"]), *(interval_text(share[cost]) if cost in share else "" for cost in costs)]
         for each, share in zip(results, shares, strict=True)
     ]
-    head = ("policy", "seed", "processor", *(f"after {cost:,.0f}" for cost in costs))
+    head = ("policy", "seed", *(f"after {cost:,.0f}" for cost in costs))
     return Table(head, rows, "Share of the levels labelled solved, after some core-seconds")
 
 
@@ -328,7 +334,8 @@ def after(each: Mapping[str, Any]) -> list[tuple[float, dict[str, Any]]]:
 
 
 def row_of(name: str, cost: Sequence[str], rates: Mapping[str, Any], player: str = SAMPLED) -> list[str]:
-    return [name, *cost, *rates_text(rates, player)]
+    ways = ((ALL, "once"), (SOLVED, "once"), (SOLVED, "best"))
+    return [name, *cost, *(interval_text(rates[levels][player][key]) for levels, key in ways)]
 
 
 def draw(results: Sequence[Mapping[str, Any]], path: Path) -> None:

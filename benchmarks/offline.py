@@ -13,8 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.cloning import SAMPLED, children_seconds, command, interval_text, kept, last_line
-from benchmarks.learners import lines_of, slug
+from benchmarks.cloning import SAMPLED, children_seconds, command, interval_text, kept, last_line, lines_of, slug
 from benchmarks.report import Report, Table
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.learn.evaluate import AGENT, SOLVED

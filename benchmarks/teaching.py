@@ -22,10 +22,10 @@ from benchmarks.cloning import (
     interval_text,
     kept,
     lines_of,
+    slug,
     timed_command,
     timed_split,
 )
-from benchmarks.learners import slug
 from benchmarks.report import Report, Table
 from levelproof.experts.imitation import ImitationConfig
 from levelproof.pipeline.errors import Failure, UserError
@@ -57,7 +57,10 @@ class Distilled(NamedTuple):
 
 
 DISTILLED = {
-    "label, teachers": Distilled("label", True, DISTILLING, "teachers label states that the learner itself gets into"),
+    "label, teachers": Distilled(
+        "label", True, DISTILLING, "teachers, none of them an expert, label states that the learner itself gets into"
+    ),
+    "masters, teachers": Distilled("masters", True, DISTILLING, "the same, with the levels' experts as first teachers"),
     "masters, rollouts": Distilled(
         "masters",
         False,
@@ -113,10 +116,9 @@ def notes(args: argparse.Namespace, players: Mapping[str, Any]) -> list[str]:
         f"{interval_text(players['sticky random']['once'])}.",
         "; ".join(f"*{name}*: `levelproof generate {' '.join(DATA[name])}`" for name in procedures) + ".",
         *(about(name) for name in args.data if name in DISTILLED),
-        "Core-seconds are CPU seconds, compiling included: of data those of the whole command, unsolved levels "
-        "included (for the same levels those of all ids); of training those of all its commands, teachers and experts "
-        "included. Steps to the goal: the mean of the witnesses. Clones keep a tenth of their levels for validation, "
-        "`distill` learns from all.",
+        "Core-seconds are CPU seconds, compiling included. Those of data are of the whole command, for all ids, solved "
+        "or not; those of training are of all its commands, teachers and experts included. Steps to the goal: the mean "
+        "of the witnesses. Clones keep a tenth of their levels for validation; `distill` learns from all.",
     ]
 
 

@@ -12,10 +12,9 @@ from benchmarks.cloning import SAMPLED
 from benchmarks.equal import RATE, SECONDS, STEPS, UPDATES, run, searched, split_of
 from levelproof import Failure, UserError
 from levelproof.pipeline.learn.evaluate import SOLVED
-from levelproof.pipeline.store.provenance import device
 
 KEPT = (
-    *("equal", "--ways", "from scratch, short actions", "--core-seconds", "3600", "--seeds", "2", "--levels", "40k"),
+    *("equal", "--ways", "from scratch, evolve", "--core-seconds", "3600", "--seeds", "2", "--levels", "40k"),
     *("--updates", "7000", "--cloning", "mirror=true", "pool=60000"),
 )
 TINY = ("ppo.environments=64", "ppo.horizon=32", "ppo.minibatches=4")
@@ -28,10 +27,10 @@ def test_search_of_a_stopped_run_is_refused(tmp_path: Path) -> None:
         searched(args, 0)
 
 
-def test_page_is_made_of_finished_runs_of_any_machine(tmp_path: Path) -> None:
+def test_page_is_made_of_finished_runs(tmp_path: Path) -> None:
     args = parser("equal").parse_args([*KEPT, "--only-finished"])
     rows = run(args).tables[0].rows
-    assert ["from scratch, short actions", "0", "AMD EPYC", "48,365,568"] in [row[:4] for row in rows]
+    assert ["from scratch, evolve", "0", "316,145,664"] in [row[:3] for row in rows]
     args.finished = tmp_path
     with pytest.raises(UserError, match="has none of these runs"):
         run(args)
@@ -39,17 +38,18 @@ def test_page_is_made_of_finished_runs_of_any_machine(tmp_path: Path) -> None:
 
 def test_page_has_the_longest_run_within_its_core_seconds(tmp_path: Path) -> None:
     args = parser("equal").parse_args([*KEPT, "--only-finished"])
-    kept = next(args.finished.glob("from-scratch-short-actions-s-0-*"))
-    shorter = kept.read_text().replace('"core_seconds": 3600.0', '"core_seconds": 1800.0', 1)
-    shorter = shorter.replace("48365568", "24000000")
-    (tmp_path / kept.name.replace("s-0-", "s-0-f")).write_text(shorter)
+    kept = next(args.finished.glob("from-scratch-evolve-s-0-*"))
+    shorter = json.loads(kept.read_text())
+    shorter |= {"core_seconds": 1800.0, "looks": shorter["looks"][:-1]}
+    shorter["curve"][-1][STEPS] = 24_000_000
+    (tmp_path / kept.name.replace("s-0-", "s-0-f")).write_text(json.dumps(shorter))
     (tmp_path / kept.name).write_text(kept.read_text())
     args.finished = tmp_path
-    for limit, steps, after in (3600.0, "48,365,568", "after 3,600"), (1800.0, "24,000,000", "after 1,800"):
+    for limit, steps, after in (3600.0, "316,145,664", "after 3,600"), (1800.0, "24,000,000", "after 1,800"):
         args.core_seconds = limit
         table, by_cost = run(args).tables
-        assert table.rows[0][3] == steps
-        assert by_cost.head == ("policy", "seed", "processor", after)
+        assert table.rows[0][2] == steps
+        assert by_cost.head[-1] == after
 
 
 def test_run_is_never_measured_later_than_planned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -62,6 +62,7 @@ def test_run_is_never_measured_later_than_planned(tmp_path: Path, monkeypatch: p
         return [line]
 
     monkeypatch.setattr(equal, "trained", trained)
+    monkeypatch.setattr(equal, "pace", lambda args: equal.PACE)
     monkeypatch.setattr(equal, "kept", lambda file, *_: {SOLVED: {SAMPLED: {"once": {"rate": file.name}}}})
     args = parser("equal").parse_args(["equal", "--folder", str(tmp_path)])
     planned = {}
@@ -72,14 +73,41 @@ def test_run_is_never_measured_later_than_planned(tmp_path: Path, monkeypatch: p
     assert planned == {200: [50, 100, 200], 400: [100, 200, 400], 600: [600]}
 
 
+def test_slower_processor_has_more_of_its_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Core-seconds are those of PACE: what was searched here at half of it counts half, and training has the rest."""
+    limits = []
+
+    def trained(args: Namespace, policy: Path, way: str, start: str, seed: int, limit: float) -> list[dict[str, float]]:
+        limits.append(limit)
+        return [{UPDATES: 1, STEPS: 10, SECONDS: limit - 2, RATE: 0.5}]
+
+    monkeypatch.setattr(equal, "trained", trained)
+    monkeypatch.setattr(equal, "pace", lambda args: equal.PACE / 2)
+    monkeypatch.setattr(equal, "searched", lambda args, seed: 100.0)
+    monkeypatch.setattr(equal, "kept", lambda *_: {SOLVED: {SAMPLED: {"once": {"rate": 0.5}}}})
+    args = parser("equal").parse_args(["equal", "--folder", str(tmp_path), "--core-seconds", "200"])
+    told = equal.measured(args, "levels, reinforcement on these levels", 0)
+    assert told["before"] == 50
+    assert limits == [2 * (100 - 50), 2 * (200 - 50)]
+    assert [look[SECONDS] for look in told["looks"]] == [99, 199]
+    assert told["curve"][-1][SECONDS] == 149
+
+
+def test_pace_is_that_after_compiling(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = [{STEPS: 60, SECONDS: 90.0}, {STEPS: 80, SECONDS: 91.0}, {STEPS: 110, SECONDS: 95.0}]
+    monkeypatch.setattr(equal, "command", lambda *_: "")
+    monkeypatch.setattr(equal, "lines_of", lambda _: lines)
+    assert equal.pace(parser("equal").parse_args(["equal", "--folder", str(tmp_path)])) == 10
+
+
 @pytest.mark.campaign
-def test_ways_end_at_the_same_core_seconds(tmp_path: Path) -> None:
+def test_ways_end_at_the_same_core_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(equal, "pace", lambda args: equal.PACE)
     words = ["equal", "--ways", "from scratch", "levels, clone, reinforcement", "--core-seconds", "200"]
     words += ["--levels", "64", "--updates", "2", "--measured", "8", "--folder", str(tmp_path / "kept")]
     args = parser("equal").parse_args([*words, "--finished", str(tmp_path / "finished"), "--set", *TINY])
     report = run(args)
     names = [row[0] for row in report.tables[0].rows]
-    assert {row[2] for row in report.tables[0].rows[:3]} == {device().removeprefix("cpu: ")}
     assert names[:3] == ["from scratch", "levels, clone", "levels, clone, reinforcement"]
     scratch, tuned = report.results
     assert scratch["before"] == 0 < tuned["before"] < 200
