@@ -2,8 +2,8 @@
 
 Everything that a way needs counts as its core-seconds. A stopped run resumes, except in a search: every command
 continues what it left, training from its checkpoint, and the folder keeps finished evaluations. A way takes hours, so
-the repository keeps finished ones, and other machines add theirs: core-seconds are those of the processor of the first
-runs, and a processor that trains from scratch at half its pace has twice as many for as much work.
+the repository keeps finished ones, and other machines add theirs: where training from scratch runs at half the pace of
+the first runs, a CPU second counts half, whether the machine or that day's learner made it slower.
 """
 
 import argparse
@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Lock
 from typing import Any, NamedTuple
 
@@ -108,9 +109,9 @@ def run(args: argparse.Namespace) -> Report:
         raise UserError(f"--only-finished: {args.finished} has none of these runs; without it they are made.")
     players, dates = results[0]["sealed"], sorted(each["date"][:10] for each in results)
     rows = [list(row) for row in dict.fromkeys(tuple(row) for each in results for row in rows_of(each))]
-    rows += [row_of(name, ("", "", "", ""), players, name) for name in PLAYERS if name in players[ALL]]
+    rows += [row_of(name, ("", "", "", "", ""), players, name) for name in PLAYERS if name in players[ALL]]
     shown = {each["way"] for each in results}
-    head = ("policy", "seed", "env steps", "core-seconds before training", "in all", *SHARES)
+    head = ("policy", "seed", "pace", "env steps", "core-seconds before training", "in all", *SHARES)
     return Report(
         "Learners at equal cost",
         results,
@@ -125,8 +126,9 @@ def run(args: argparse.Namespace) -> Report:
             f"({', '.join((f'{args.updates:,} updates', *(f'`{each}`' for each in (*SCRATCH, *args.cloning))))}); then "
             "reinforcement learning, on random levels unless its row says otherwise"
             f"{f'; what {START} took is not counted' if any(WAYS[way].start == START for way in shown) else ''}. "
-            f"Core-seconds are CPU seconds on a core that trains from scratch on s at {PACE:,.0f} env steps a second, "
-            f"with the code of the run; those of another pace ({paces(results)}) are converted. *Of all*: "
+            "*Pace*: env steps that training from scratch on s takes in a CPU second of the core, with the learner of "
+            f"that day. A core-second here is the CPU time of {PACE:,.0f} of them, so seconds of different paces are "
+            "comparable, to some 5%. *Of all*: "
             f"{players[ALL]['random']['levels']:,} levels, of which some cannot be solved; *of solved*, and the best "
             f"of 8 attempts at them: the {players[SOLVED]['random']['levels']:,} that are labelled solved.",
             *dict.fromkeys(each["remark"] for each in results if "remark" in each),
@@ -215,18 +217,16 @@ def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
 
 def pace(args: argparse.Namespace) -> float:
     """Return how many env steps of s a core-second of training from scratch takes here; measured once a folder."""
-    policy, words = args.folder / "pace", ("size=s", "cores=1", *SCRATCH, "interval=5")
+    file, words = args.folder / "pace.json", ("size=s", "cores=1", *SCRATCH, "interval=5")
     steps = PACED * compose_train(words).ppo.steps_per_update
-    with PACING:
-        command("train", *words, f"ppo.env_steps={steps}", "-o", policy)
-    first, *_, last = lines_of(policy)  # the first comes after compiling
-    return (last[STEPS] - first[STEPS]) / (last[SECONDS] - first[SECONDS])
-
-
-def paces(results: Sequence[Mapping[str, Any]]) -> str:
-    """Say which other paces the core-seconds of results were converted from."""
-    others = dict.fromkeys(f"{each['pace']:,.0f}" for each in results if "pace" in each)
-    return f"here {', '.join(others)}" if others else "here none"
+    with PACING, TemporaryDirectory() as folder:  # one that was stopped would have compiled twice
+        if not file.exists():
+            command("train", *words, f"ppo.env_steps={steps}", "-o", folder)
+            first, *_, last = lines_of(Path(folder))  # the first comes after compiling
+            rate = (last[STEPS] - first[STEPS]) / (last[SECONDS] - first[SECONDS])
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write(file, json.dumps(rate).encode())
+        return json.loads(file.read_text())
 
 
 def measuring(args: argparse.Namespace) -> Sequence[Any]:
@@ -306,12 +306,12 @@ def trained(
 
 def rows_of(each: Mapping[str, Any]) -> list[list[str]]:
     """Return the rows of a policy: of its clone, if it has one, and of itself."""
-    last, rows, seed = each["curve"][-1], [], str(each["seed"])
+    last, rows, run = each["curve"][-1], [], (str(each["seed"]), f"{each.get('pace', PACE):,.0f}")
     if each["cloned"]:
-        cost = seed, "0", "", f"{each['before']:,.0f}"
+        cost = *run, "0", "", f"{each['before']:,.0f}"
         name = "levels, clone, teachers" if WAYS[each["way"]].teachers else "levels, clone"
         rows.append(row_of(name, cost, each["cloned"]))
-    cost = seed, f"{last[STEPS]:,}", f"{each['before']:,.0f}", f"{each['before'] + last[SECONDS]:,.0f}"
+    cost = *run, f"{last[STEPS]:,}", f"{each['before']:,.0f}", f"{each['before'] + last[SECONDS]:,.0f}"
     return [*rows, row_of(each["way"], cost, each["sealed"])]
 
 

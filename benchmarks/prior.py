@@ -105,8 +105,8 @@ def run(args: argparse.Namespace) -> Report:
             f"So the attempts cost {', '.join(f'{ratio:.0f}' for ratio in ratios)} times what they could save "
             f"({', '.join(one['size'] for one in results)}), and find {total('found_of_unsolved')} of "
             f"{total('unsolved'):,} unsolved levels. So no setting lets a policy play before "
-            "the search. Proposals within the search, and experts that start from the policy, are ruled out "
-            "[by estimate](../tried/learners.md#a-policy-before-the-search) alone.",
+            "the search. Proposals within the search, and experts that start from the policy, are ruled out only "
+            "[by an estimate](../tried/learners.md#a-policy-before-the-search).",
         ],
     )
 

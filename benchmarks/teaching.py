@@ -60,7 +60,6 @@ DISTILLED = {
     "label, teachers": Distilled(
         "label", True, DISTILLING, "teachers, none of them an expert, label states that the learner itself gets into"
     ),
-    "masters, teachers": Distilled("masters", True, DISTILLING, "the same, with the levels' experts as first teachers"),
     "masters, rollouts": Distilled(
         "masters",
         False,

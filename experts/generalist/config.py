@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from levelproof.levelgen.task.rules import MAX_REWARD_SCALE, TaskParams
 from levelproof.physics.bounds import require
 
-CHUNK = 256  # lanes and samples of a core are multiples of it, or fewer; measured levels are padded to one
+CHUNK = 256  # lanes and samples of a core are multiples of it, or fewer; measured levels are padded to a multiple
 
 MAX_REPEAT = 256  # env steps; an episode of the default rules is then one action
 
@@ -90,7 +90,7 @@ class PPOConfig:
                 f"environments is {self.environments}: with {cores} core{'s' * (cores != 1)} it must be a multiple of "
                 f"{cores if self.environments < cores * CHUNK else cores * CHUNK}"
             )
-        some = max(int(round(lanes * self.subsample, 6)), 1)
+        some = max(int(round(lanes * self.subsample, 6)), 1)  # 0.29 times 25600 is a little less than 7424
         some -= some % min(some, CHUNK)
         if (chunks := some // min(some, CHUNK) * self.horizon) % self.minibatches:
             raise ValueError(

@@ -30,7 +30,7 @@ def test_search_of_a_stopped_run_is_refused(tmp_path: Path) -> None:
 def test_page_is_made_of_finished_runs(tmp_path: Path) -> None:
     args = parser("equal").parse_args([*KEPT, "--only-finished"])
     rows = run(args).tables[0].rows
-    assert ["from scratch, evolve", "0", "316,145,664"] in [row[:3] for row in rows]
+    assert ["from scratch, evolve", "0", "316,145,664"] in [[row[0], row[1], row[3]] for row in rows]
     args.finished = tmp_path
     with pytest.raises(UserError, match="has none of these runs"):
         run(args)
@@ -48,7 +48,7 @@ def test_page_has_the_longest_run_within_its_core_seconds(tmp_path: Path) -> Non
     for limit, steps, after in (3600.0, "316,145,664", "after 3,600"), (1800.0, "24,000,000", "after 1,800"):
         args.core_seconds = limit
         table, by_cost = run(args).tables
-        assert table.rows[0][2] == steps
+        assert table.rows[0][3] == steps
         assert by_cost.head[-1] == after
 
 
@@ -94,10 +94,13 @@ def test_slower_processor_has_more_of_its_seconds(tmp_path: Path, monkeypatch: p
 
 
 def test_pace_is_that_after_compiling(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    lines = [{STEPS: 60, SECONDS: 90.0}, {STEPS: 80, SECONDS: 91.0}, {STEPS: 110, SECONDS: 95.0}]
-    monkeypatch.setattr(equal, "command", lambda *_: "")
+    lines, commands = [{STEPS: 60, SECONDS: 90.0}, {STEPS: 80, SECONDS: 91.0}, {STEPS: 110, SECONDS: 95.0}], []
+    monkeypatch.setattr(equal, "command", lambda *words: commands.append(words))
     monkeypatch.setattr(equal, "lines_of", lambda _: lines)
-    assert equal.pace(parser("equal").parse_args(["equal", "--folder", str(tmp_path)])) == 10
+    for _ in range(2):
+        assert equal.pace(parser("equal").parse_args(["equal", "--folder", str(tmp_path)])) == 10
+    ((*words, _),) = commands
+    assert words[-2:] == ["ppo.env_steps=7864320", "-o"], "fifteen updates, measured once a folder"
 
 
 @pytest.mark.campaign

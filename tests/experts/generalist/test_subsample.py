@@ -72,7 +72,8 @@ def test_a_draw_that_rounds_up_to_the_total_chooses_what_counts(monkeypatch: pyt
 
 
 @pytest.mark.parametrize(
-    ("lanes", "share", "samples"), [(2048, 0.5, 1024), (2048, 0.3, 2 * CHUNK), (2048, 0.01, 20), (64, 1, 64)]
+    ("lanes", "share", "samples"),
+    [(2048, 0.5, 1024), (2048, 0.3, 2 * CHUNK), (2048, 0.01, 20), (64, 1, 64), (25600, 0.29, 29 * CHUNK)],
 )
 def test_samples_are_whole_chunks(lanes: int, share: float, samples: int) -> None:
     assert PPOConfig(environments=lanes, subsample=share).samples(1) == samples

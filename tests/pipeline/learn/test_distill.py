@@ -34,7 +34,6 @@ from tests.pipeline.made import honest_split, made_job
 TINY = ("network.width=8", "network.depth=1", "network.heads=1")
 ROUNDS = ("train.updates=6", "interval=2", "train.batch=32", "episodes=8", "states=16", "buffer=64")
 TEACHERS = ("teachers.witness=2", "teachers.random=8", "teachers.learner=1")
-FILES = ("policy.safetensors", "checkpoint.safetensors", "config.json")
 
 
 def distilled(folder: Path, split: Path, *words: str, teachers: tuple[str, ...] = TEACHERS) -> Path:
