@@ -131,6 +131,8 @@ def run(args: argparse.Namespace) -> Report:
             "comparable, to some 5%. *Of all*: "
             f"{players[ALL]['random']['levels']:,} levels, of which some cannot be solved; *of solved*, and the best "
             f"of 8 attempts at them: the {players[SOLVED]['random']['levels']:,} that are labelled solved.",
+            *[f"*Teachers*: half of the clone's updates are of `levelproof distill {' '.join(DISTILLING)}`."]
+            * any(WAYS[way].teachers for way in shown),
             *dict.fromkeys(each["remark"] for each in results if "remark" in each),
             *(f"{way}: `levelproof train {words_of(args, way, 0)}{started(way)}`." for way in WAYS if way in shown),
             f"![Shares that reach the goal, in training and of sealed levels, against core-seconds]({PLOT})",
