@@ -24,6 +24,7 @@ WAYS = {  # name: settings of `levelproof train`
     "from scratch": (*FEW, "ppo.learning_rate=5e-4", "network.width=64"),
 }
 ATTEMPTS = PROTOCOLS[HANDMADE].attempts
+PLAYERS = "random", "sticky random"
 
 
 def register(parser: argparse.ArgumentParser) -> None:
@@ -55,11 +56,12 @@ def run(args: argparse.Namespace) -> Report:
         "most probable",
         f"best of {ATTEMPTS}",
     )
+    rows = [row for each in results for row in rows_of(each)]
     settings = "; ".join(f"*{way}*: `{' '.join((*words, *args.set))}`" for way, words in WAYS.items())
     return Report(
         "Handmade levels, with and without training on them",
         results,
-        [Table(head, [row_of(each) for each in results], "Share of the reference's handmade levels that are solved")],
+        [Table(head, rows, "Share of the reference's handmade levels that are solved")],
         [
             f"*Not trained on them* is {args.start}; *tuned* starts from it. Training uses all levels of one size "
             f"({', '.join(f'{size}: {HANDMADE_LEVELS[size]}' for size in args.sizes)}), and policies play these, "
@@ -85,8 +87,12 @@ def zero_shot(args: argparse.Namespace, size: str) -> dict[str, Any]:
     return kept(args.folder / f"{slug(args.start)}-{size}.json", args.start, "--on", HANDMADE, "--size", size)
 
 
-def row_of(each: Mapping[str, Any]) -> list[str]:
-    last, rates = each["last"], each["rates"][ALL]
+def rows_of(each: Mapping[str, Any]) -> list[list[str]]:
+    """Return the row of a policy, after those of random play if it was not trained on the levels."""
+    last, rates, size = each["last"], each["rates"][ALL], each["size"]
     cost = (f"{last[STEPS]:,}", f"{last[SECONDS]:,.0f}") if last else ("0", "")
     ways = (SAMPLED, "once"), (GREEDY, "once"), (SAMPLED, "best")
-    return [each["size"], each["way"], *cost, *(interval_text(rates[player][key]) for player, key in ways)]
+    shown = lambda player, key: interval_text(rates[player][key])
+    baselines = [[size, name, "", "", shown(name, "once"), "", shown(name, "best")] for name in PLAYERS]
+    row = [size, each["way"], *cost, *(shown(*way) for way in ways)]
+    return [row] if last else [*baselines, row]

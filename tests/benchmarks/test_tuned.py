@@ -16,7 +16,7 @@ def test_policies_are_trained_on_the_levels_that_they_play(tmp_path: Path) -> No
     args = parser("tuned").parse_args(words)
     report = run(args)
     rows = report.tables[0].rows
-    assert [row[1] for row in rows] == ["not trained on them", "tuned", "from scratch"]
-    assert [row[2] for row in rows] == ["0", "16,384", "16,384"]
+    assert [row[1] for row in rows] == ["random", "sticky random", "not trained on them", "tuned", "from scratch"]
+    assert [row[2] for row in rows] == ["", "", "0", "16,384", "16,384"]
     assert all(each["rates"]["all"]["policy, sampled"]["levels"] == 10 for each in report.results)
     assert run(args).tables == report.tables, "finished training and evaluations are kept"
