@@ -13,10 +13,9 @@ from benchmarks.report import Report, Table
 from levelproof.experts.networks.saved import WEIGHTS, load_policy, policy_folder
 from levelproof.levelgen.level import SIZES
 from levelproof.pipeline.learn.evaluate import ALL
-from levelproof.pipeline.learn.published import HANDMADE, PROTOCOLS, RANDOM
+from levelproof.pipeline.learn.published import AGENTS, HANDMADE, PROTOCOLS, RANDOM
 from levelproof.pipeline.read.policies import policy_at
 
-ENV_STEPS = {"sfl-paper": "18 billion, random l", "sfl-1m-envs": "376 billion, random m"}  # README of kinetix-env 3.0.2
 BASELINES = ("doing nothing", "random", "sticky random")
 
 
@@ -102,7 +101,7 @@ def table_of(results: Sequence[dict[str, Any]], title: str) -> Table:
     rows += [[f"**{name}**", own[0]["env_steps"], *(once(each, SAMPLED) for each in own)] for name, own in of.items()]
     if all(each["published"] for each in first):
         rates = lambda agent: [f"{each['published'][agent]:.0%}" for each in first]
-        rows += [[agent, steps, *rates(agent)] for agent, steps in ENV_STEPS.items()]
+        rows += [[agent, ", ".join(origin), *rates(agent)] for agent, origin in AGENTS.items()]
     return Table(
         ("player", "env steps, trained on", *(f"{e['size']} ({e['levels']} levels)" for e in first)), rows, title
     )

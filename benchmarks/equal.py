@@ -138,8 +138,7 @@ def run(args: argparse.Namespace) -> Report:
             f"![Shares that reach the goal, in training and of sealed levels, against core-seconds]({PLOT})",
             "Left: share of training episodes that reach the goal, by the current weights, on fresh random levels or "
             "those that the way trains on. Right, as in the table: share of the sealed levels labelled solved that the "
-            "saved average of the weights solves; after a clone, the first point is the clone. Some runs were measured "
-            "only at their end.",
+            "saved average of the weights solves; after a clone, the first point is the clone.",
         ],
         plots={PLOT: partial(draw, results)},
         made=f"{' to '.join(dict.fromkeys((dates[0], dates[-1])))}, on "
@@ -308,7 +307,7 @@ def trained(
 
 def rows_of(each: Mapping[str, Any]) -> list[list[str]]:
     """Return the rows of a policy: of its clone, if it has one, and of itself."""
-    last, rows, run = each["curve"][-1], [], (str(each["seed"]), f"{each.get('pace', PACE):,.0f}")
+    last, rows, run = each["curve"][-1], [], (str(each["seed"]), f"{each['pace']:,.0f}")
     if each["cloned"]:
         cost = *run, "0", "", f"{each['before']:,.0f}"
         name = "levels, clone, teachers" if WAYS[each["way"]].teachers else "levels, clone"
@@ -319,7 +318,7 @@ def rows_of(each: Mapping[str, Any]) -> list[list[str]]:
 
 def by_cost(results: Sequence[Mapping[str, Any]]) -> Table:
     """Return the shares of solved sealed levels that policies had after some core-seconds, those before included."""
-    shares = [dict(after(each)) for each in results]
+    shares = [{look["planned"]: look["solved"] for look in each["looks"]} for each in results]
     costs = sorted({cost for each in shares for cost in each})
     rows = [
         [each["way"], str(each["seed"]), *(interval_text(share[cost]) if cost in share else "" for cost in costs)]
@@ -327,12 +326,6 @@ def by_cost(results: Sequence[Mapping[str, Any]]) -> Table:
     ]
     head = ("policy", "seed", *(f"after {cost:,.0f}" for cost in costs))
     return Table(head, rows, "Share of the levels labelled solved, after some core-seconds")
-
-
-def after(each: Mapping[str, Any]) -> list[tuple[float, dict[str, Any]]]:
-    """Return the core-seconds after which a policy was to be measured, and its share of the solved levels then."""
-    end = [(each["core_seconds"], each["sealed"][SOLVED][SAMPLED]["once"])]
-    return [(look["planned"], look["solved"]) for look in each.get("looks", [])] or end
 
 
 def row_of(name: str, cost: Sequence[str], rates: Mapping[str, Any], player: str = SAMPLED) -> list[str]:
@@ -362,8 +355,5 @@ def draw(results: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 def looks_of(each: Mapping[str, Any]) -> list[tuple[float, float]]:
     """Return core-seconds and shares of the solved sealed levels: of the clone, if there is one, and of the policy."""
-    rate = lambda rates: rates[SOLVED][SAMPLED]["once"]["rate"]
-    clone = [(each["before"], rate(each["cloned"]))] if each["cloned"] else []
-    end = [(each["before"] + each["curve"][-1][SECONDS], rate(each["sealed"]))]
-    looks = [(look[SECONDS], look["solved"]["rate"]) for look in each.get("looks", [])]
-    return clone + (looks or end)
+    clone = [(each["before"], each["cloned"][SOLVED][SAMPLED]["once"]["rate"])] if each["cloned"] else []
+    return [*clone, *((look[SECONDS], look["solved"]["rate"]) for look in each["looks"])]

@@ -39,14 +39,12 @@ def register(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> Report:
     args.folder.mkdir(parents=True, exist_ok=True)
     levels = handmade_folder()
-    runs = [(size, way, seed) for seed in range(args.seeds) for size in args.sizes for way in WAYS]
+    runs = [(size, way, seed) for size in args.sizes for way in WAYS for seed in range(args.seeds)]
     with ThreadPoolExecutor(len(own_cores())) as threads:
         trained = [*threads.map(lambda one: measured(args, levels, *one), runs)]
     untrained = [{"size": size, "way": "not trained on them", "last": None, "rates": zero_shot(args, size)}
                  for size in args.sizes]  # fmt: skip
-    ways = [each["way"] for each in (*untrained, *trained)]
-    order = lambda each: (args.sizes.index(each["size"]), ways.index(each["way"]))
-    results = sorted((*untrained, *trained), key=order)
+    results = sorted((*untrained, *trained), key=lambda each: args.sizes.index(each["size"]))
     head = (
         "levels",
         "policy",

@@ -27,7 +27,7 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.learn.looks import LOOKS, SEALED, log_look
 from levelproof.pipeline.learn.measured import MeasuredLevels, is_split, levels_in, midway_levels, sealed_levels
-from levelproof.pipeline.learn.published import PROTOCOLS, published_levels
+from levelproof.pipeline.learn.published import AGENTS, PROTOCOLS, published_levels
 from levelproof.pipeline.learn.sealed import SEALED as SEALED_IDS
 from levelproof.pipeline.learn.solve_rates import Solved, difference, solve_rates
 from levelproof.pipeline.learn.specialists import Specialists, sealed_specialists, specialists_of
@@ -107,10 +107,8 @@ def _print_all(facts: Sequence[dict[str, Any]], attempts: int) -> None:
         _print(group, attempts, Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else WIDE))
     print("In brackets: 95% intervals over levels.")
     if any(group["published"] for group in facts):
-        print(
-            "sfl-paper (18 billion env steps on random l), sfl-1m-envs (376 billion on random m): the reference's "
-            "agents, with the rates that it published."
-        )
+        agents = ", ".join(f"{name} ({steps} env steps on {levels})" for name, (steps, levels) in AGENTS.items())
+        print(f"{agents}: the reference's agents, with the rates that it published.")
 
 
 def _require_sizes(contestants: Sequence["_Contestant"], groups: Sequence[MeasuredLevels]) -> None:

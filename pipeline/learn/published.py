@@ -28,6 +28,7 @@ PACKAGE = "kinetix-env==3.0.2"
 HANDMADE, RANDOM = "handmade", "reference-random"
 HANDMADE_LEVELS = {"s": 10, "m": 24, "l": 40}
 RANDOM_LEVELS = 512  # levels per size
+AGENTS = {"sfl-paper": ("18 billion", "random l"), "sfl-1m-envs": ("376 billion", "random m")}  # env steps, levels
 
 
 class Protocol(NamedTuple):
