@@ -40,6 +40,7 @@ class PolicyKind(StrEnum):
     PIXELS = "pixels"  # convolutions on a picture
 
 
+MAX_WIDTH, MAX_DEPTH, MAX_HEADS = 1024, 16, 64  # a policy's folder may be a stranger's
 LANE_BY_LANE = (PolicyKind.INVARIANT, PolicyKind.FLAT)  # kinds whose module sees one level at a time
 
 
@@ -53,7 +54,8 @@ class NetworkConfig:
     heads: int = 4  # heads of attention
 
     def __post_init__(self) -> None:
-        require(self, ("width", "depth", "heads"), 1)
+        for name, most in ("width", MAX_WIDTH), ("depth", MAX_DEPTH), ("heads", MAX_HEADS):
+            require(self, (name,), 1, most)
         if self.kind is PolicyKind.ATTENTION and self.width % self.heads:
             raise ValueError(f"width is {self.width}: it must be a multiple of heads = {self.heads}")
         if self.kind is PolicyKind.TRANSFORMER and self.heads % MASKS:

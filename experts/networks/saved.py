@@ -4,6 +4,7 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from operator import index
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,14 @@ import numpy as np
 from flax.typing import VariableDict
 from jaxtyping import Array, Float, Int, Key
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save
+from safetensors.numpy import load, save
 
 from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy, policy_logits
 from levelproof.experts.policy import most_probable, sample
+from levelproof.levelgen.files.entries import abbreviate
 from levelproof.levelgen.identity.keys import key_of_seed
 from levelproof.levelgen.level import ACTIONS, Level, name_of, size_of
+from levelproof.levelgen.pictures.words import printable
 from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.observe.kinds import ObservationType
 from levelproof.levelgen.task.rules import TaskState
@@ -28,6 +31,9 @@ WEIGHTS, CONFIG = "policy.safetensors", "config.json"
 BUILTIN = "builtin:"  # before the name of a policy that comes with levelproof
 BUILTIN_AT = Path(__file__).parent / "builtin"
 FORMAT = 1  # of config.json
+MAX_CONFIG = 1_000_000  # bytes of it; that of a policy trained in many steps has 8,100
+MAX_HEADER = 1_000_000  # bytes of the weights' file besides the weights
+MAX_REASON = 300  # characters of a library's message in ours
 
 
 class PolicyError(ValueError):
@@ -120,24 +126,34 @@ def load_policy(folder: str | os.PathLike[str]) -> Policy:
     try:
         if not all((path / name).is_file() for name in (CONFIG, WEIGHTS)):  # to read a pipe would wait
             raise FileNotFoundError
-        config = json.loads((path / CONFIG).read_text())
-        if config["format"] != FORMAT:
+        config = json.loads(_read(path / CONFIG, MAX_CONFIG))
+        if index(config["format"]) != FORMAT:
             raise PolicyError(
-                f"The policy {path} has format {config['format']}, but this levelproof reads format {FORMAT}: "
-                "update levelproof."
+                f"The policy {path} has format {abbreviate(config['format'])}, but this levelproof reads format "
+                f"{FORMAT}: update levelproof."
             )
-        shape, origin = config["network"], config["origin"]
-        network = NetworkConfig(**shape | {"kind": PolicyKind(shape["kind"])})
+        shape, origin = dict(config["network"]), dict(config["origin"])
+        network = NetworkConfig(PolicyKind(shape.pop("kind")), **{name: index(x) for name, x in shape.items()})
         size = None if config["size"] is None else size_of(config["size"])
         wanted = jax.eval_shape(lambda: initial_policy(key_of_seed(0), network, size or size_of("m")))
-        params = unnamed(wanted, load_file(path / WEIGHTS))
+        room = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(wanted))
+        params = unnamed(wanted, load(_read(path / WEIGHTS, room + MAX_HEADER)))
     except FileNotFoundError:
         raise PolicyError(f"There is no policy in {path}: `levelproof clone SPLIT -o {path}` makes one.") from None
-    except (OSError, KeyError, TypeError, ValueError, RecursionError, SafetensorError) as error:
-        if isinstance(error, PolicyError):
-            raise
-        raise PolicyError(f"The policy in {path} is damaged ({error}): make or copy it again.") from None
+    except PolicyError:
+        raise
+    except (OSError, LookupError, TypeError, ValueError, OverflowError, RecursionError, SafetensorError) as error:
+        reason = printable(str(error))[:MAX_REASON]
+        raise PolicyError(f"The policy in {path} is damaged ({reason}): make or copy it again.") from None
     return Policy(network, params, size, origin)
+
+
+def _read(file: Path, most: int) -> bytes:
+    """Read a file. Raise ValueError if it has more than `most` bytes."""
+    with file.open("rb") as opened:
+        if os.fstat(opened.fileno()).st_size > most:
+            raise ValueError(f"{file.name} has more than {most:,} bytes")
+        return opened.read()
 
 
 def policy_folder(name: str | os.PathLike[str]) -> Path:

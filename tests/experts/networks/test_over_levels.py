@@ -141,6 +141,7 @@ def test_pixel_policy_sees_where_bodies_are_and_not_how_they_move() -> None:
 def test_logits_differ_between_levels_and_states_of_a_lane_do_not_touch_others() -> None:
     levels, policy = levelproof.sample_levels(np.arange(COUNT), "s"), policy_of(PolicyKind.ATTENTION)
     alone, among = (logits_of(policy.params, policy.network, some) for some in (levels[[3] * COUNT], levels))
+    assert np.ptp(among, axis=1).max() > 1e-2
     np.testing.assert_allclose(among[:, [3] * COUNT], alone, atol=1e-5)
 
 
@@ -162,7 +163,9 @@ def test_unusable_policies_are_refused(tmp_path: Path) -> None:
     with pytest.raises(levelproof.PolicyError, match="size s only, not m"):
         policy.logits(levels, levels.state)
     config = (tmp_path / CONFIG).read_text()
-    for change in ('"width": 16', '"width": 17'), ('"origin"', '"other"'):
+    changes = ('"width": 16', '"width": 17'), ('"depth": 2', f'"depth": {10**9}'), ('"origin"', '"other"')
+    for change in changes:
+        assert change[0] in config
         (tmp_path / CONFIG).write_text(config.replace(*change))
         with pytest.raises(levelproof.PolicyError, match="damaged"):
             levelproof.load_policy(tmp_path)

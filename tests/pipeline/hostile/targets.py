@@ -30,6 +30,7 @@ from levelproof.configs.errors import ConfigError
 from levelproof.configs.numbers import parse_count
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.labels import Label
+from levelproof.experts.networks.saved import PolicyError
 from levelproof.experts.training.slots import begin
 from levelproof.experts.verdict.judge import KeptExpert
 from levelproof.experts.witness.success import no_success
@@ -68,13 +69,14 @@ from tests.pipeline.hostile.mutations import (
     random_value,
     remove,
 )
+from tests.pipeline.hostile.policies import policies
 from tests.pipeline.hostile.seeds import seeds
 from tests.pipeline.hostile.tables import mutate_parquet
 from tests.pipeline.made import made_job, made_split, played_split
 from tests.pipeline.read.kinetix.folder import GOLDEN
 
 Target = Callable[[Random], None]
-Refused = (LevelproofError, LevelFileError, ConfigError, FormatError, NoteError)
+Refused = (LevelproofError, LevelFileError, ConfigError, FormatError, NoteError, PolicyError)
 ENDS = (FormatError, NoteError)  # whose messages are ends of sentences
 
 
@@ -445,4 +447,5 @@ TARGETS: dict[str, Callable[[Path], Target]] = {
     "listings": listings,
     "pieces": pieces,
     "settings": overrides,
+    "policies": policies,
 }
