@@ -118,7 +118,13 @@ def set_role(level: Level, body: int, role: int) -> Level:
 
 def fix(level: Level, body: int, fixed: bool) -> Level:
     """Fix a body in place, or free it."""
-    return _edited(level, lambda one: _weigh(one, _movable(one, body), fixed))
+
+    def change(one: Level) -> None:
+        _weigh(one, _movable(one, body), fixed)
+        if fixed:  # the engine moves whatever has a velocity, as the reference does
+            one.state.velocity[body], one.state.angular_velocity[body] = 0.0, 0.0
+
+    return _edited(level, change)
 
 
 def add_joint(level: Level, x: float, y: float, fixed: bool = False) -> Level:
@@ -163,7 +169,7 @@ def bind(level: Level, kind: str, index: int, binding: int) -> Level:
     """Choose the entry of an action that a `joint`'s motor or a `thruster` obeys."""
 
     def change(one: Level) -> None:
-        (active, bindings), count = (get(one) for get in _OF_KIND[kind]), _BINDINGS[kind]
+        (active, bindings), count = (get(one) for get in OF_KIND[kind]), BINDINGS[kind]
         bindings[_active(active, index, kind)] = binding % count
 
     return _edited(level, change)
@@ -174,7 +180,7 @@ def delete(level: Level, kind: str, index: int) -> Level:
 
     def change(one: Level) -> None:
         if kind != "body":
-            active = _OF_KIND[kind][0](one)
+            active = OF_KIND[kind][0](one)
             active[_active(active, index, kind)] = False
             return
         model, body = one.model, _movable(one, index)
@@ -185,8 +191,8 @@ def delete(level: Level, kind: str, index: int) -> Level:
     return _edited(level, change)
 
 
-_BINDINGS = {"joint": MOTOR_BINDINGS, "thruster": THRUSTER_BINDINGS}
-_OF_KIND: dict[str, tuple[Callable[[Level], Any], Callable[[Level], Any]]] = {  # active flags, bindings
+BINDINGS = {"joint": MOTOR_BINDINGS, "thruster": THRUSTER_BINDINGS}
+OF_KIND: dict[str, tuple[Callable[[Level], Any], Callable[[Level], Any]]] = {  # active flags, bindings
     "joint": (lambda one: one.model.joint_active, lambda one: one.motor_binding),
     "thruster": (lambda one: one.model.thruster_active, lambda one: one.thruster_binding),
 }

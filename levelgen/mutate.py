@@ -15,7 +15,9 @@ from jaxtyping import Array, Bool
 
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.edit import (
+    BINDINGS,
     MAX_REACH,
+    OF_KIND,
     SHAPES,
     EditError,
     add_body,
@@ -32,8 +34,6 @@ from levelproof.levelgen.edit import (
 )
 from levelproof.levelgen.level import (
     ACTIONS,
-    MOTOR_BINDINGS,
-    THRUSTER_BINDINGS,
     WORLD_SIDE,
     Level,
     Role,
@@ -162,12 +162,8 @@ def _add_thruster(level: Level, rng: np.random.Generator) -> Level:
 
 def _bind(level: Level, rng: np.random.Generator) -> Level:
     kind = ("joint", "thruster")[rng.integers(2)]
-    bindings, count = {
-        "joint": (level.motor_binding, MOTOR_BINDINGS),
-        "thruster": (level.thruster_binding, THRUSTER_BINDINGS),
-    }[kind]
-    row = _one_of_kind(level, kind, rng)
-    return bind(level, kind, row, int(bindings[row, 0]) + int(rng.integers(1, count)))
+    row, bindings = _one_of_kind(level, kind, rng), OF_KIND[kind][1](level)
+    return bind(level, kind, row, int(bindings[row, 0]) + int(rng.integers(1, BINDINGS[kind])))
 
 
 def _delete(level: Level, rng: np.random.Generator) -> Level:
@@ -190,8 +186,7 @@ def _role(level: Level, body: int) -> Role:
 
 
 def _one_of_kind(level: Level, kind: str, rng: np.random.Generator) -> int:
-    active = level.model.joint_active if kind == "joint" else level.model.thruster_active
-    return _chosen(np.flatnonzero(np.asarray(active)), kind, rng)
+    return _chosen(np.flatnonzero(np.asarray(OF_KIND[kind][0](level))), kind, rng)
 
 
 def _chosen(rows: Any, kind: str, rng: np.random.Generator) -> int:

@@ -1,4 +1,4 @@
-"""Bounds checks for settings; their dataclasses call them on creation."""
+"""Checks of settings, which their dataclasses make on creation, and of JAX's precision."""
 
 from collections.abc import Iterable
 from math import inf, isfinite
@@ -9,7 +9,8 @@ import numpy as np
 
 
 def require(settings: Any, names: Iterable[str], least: float, most: float = inf, above: bool = False) -> None:
-    """Check that each named setting is finite and within `least` .. `most` (if `above`: and not `least` itself).
+    """Check that each named setting is finite and within `least` .. `most` (if `above`: and not `least` itself,
+    in single precision).
 
     Raises:
         ValueError: a setting is out of bounds; the message starts with its name.
@@ -17,8 +18,9 @@ def require(settings: Any, names: Iterable[str], least: float, most: float = inf
     for name in names:
         value = getattr(settings, name)
         if not isfinite(value) or not least <= value <= most or (above and np.float32(value) == np.float32(least)):
-            within = f"at least {least}" if most == inf else f"between {least} and {most}"
-            wanted = "a finite number" if not isfinite(value) else f"above {least}" if above else within
+            low = f"above {least}" if above else f"at least {least}"
+            within = f"{low} and at most {most}" if above else f"between {least} and {most}"
+            wanted = "a finite number" if not isfinite(value) else low if most == inf else within
             raise ValueError(f"{name} is {value}: it must be {wanted}")
 
 

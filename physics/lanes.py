@@ -44,15 +44,15 @@ class Ref(Rows, Protocol):
     def __setitem__(self, index: Any, value: ArrayLike, /) -> None: ...
 
 
-def each(count: Scalar, do: Callable[[Any], None], first: Scalar = 0) -> None:
-    """Call do(i) for i = first, ..., count - 1."""
-    if isinstance(count, int) and isinstance(first, int) and first >= count:
+def each(stop: Scalar, do: Callable[[Any], None], first: Scalar = 0) -> None:
+    """Call do(i) for i = first, ..., stop - 1."""
+    if isinstance(stop, int) and isinstance(first, int) and first >= stop:
         return  # without tracing `do`: the arrays may have no rows
 
     def body(i, _):
         do(i)
 
-    jax.lax.fori_loop(first, count, body, None)
+    jax.lax.fori_loop(first, stop, body, None)
 
 
 def when(condition: Bool[Array, ""], do: Callable[[], None]) -> None:

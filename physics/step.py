@@ -49,7 +49,7 @@ def step(
         NotImplementedError: the CPU is neither x86-64 nor AArch64.
     """
     inputs = Inputs(model, state, motor, thrust)
-    if state.position.dtype != jnp.float32:
+    if jax.dtypes.canonicalize_dtype(state.position.dtype) != jnp.float32:
         return on_all_lanes(inputs, params, with_contacts)
     return by_platform(
         lambda inputs: as_machine_code(inputs, params, with_contacts),

@@ -22,6 +22,7 @@ FIXED_POLYGONS = 4  # floor, left wall, right wall, ceiling; pairs among them ar
 MAX_VERTICES = 4  # of a polygon; a triangle leaves its fourth vertex unused
 SOLVER_BATCH = 16  # pairs that read the same velocities; the reference's result depends on it
 SOLVER_ITERATIONS = 10  # fewer: stacks sag and chains stretch; more: slower, and no longer the reference's result
+MIN_DT, MAX_DT = 1e-6, 1  # s
 MAX_CONSTANT = 1e6  # upper bound of every constant in Params: above useful values, and products stay finite in float32
 
 
@@ -63,7 +64,7 @@ class Params:
 
     def __post_init__(self) -> None:
         require(self, [field.name for field in fields(self) if field.type is float], 0, MAX_CONSTANT)
-        require(self, ("dt",), 1e-6, 1)
+        require(self, ("dt",), MIN_DT, MAX_DT)
 
 
 DEFAULT_PARAMS = Params()

@@ -9,11 +9,20 @@ from dataclasses import dataclass
 from typing import Any
 
 from levelproof.levelgen.level import MAX_PER_KIND, MOTOR_BINDINGS, THRUSTER_BINDINGS, Role
-from levelproof.physics.types import FIXED_POLYGONS, MAX_VERTICES, SOLVER_BATCH, SOLVER_ITERATIONS, Size
+from levelproof.levelgen.task.rules import MAX_REWARD_SCALE, MAX_STEPS
+from levelproof.physics.types import (
+    FIXED_POLYGONS,
+    MAX_CONSTANT,
+    MAX_DT,
+    MAX_VERTICES,
+    MIN_DT,
+    SOLVER_BATCH,
+    SOLVER_ITERATIONS,
+    Size,
+)
 
 MAX_QUANTITY = 1000.0  # of a body, joint or thruster; the engine itself clips at 15 m and 100 m/s
 MAX_INVERSE = 1e9  # 1/kg and 1/(kg m^2)
-MAX_RULE = 1_000_000
 
 
 class LevelFileError(ValueError):
@@ -165,9 +174,8 @@ NO_CONTACT = {
     "restitution_velocity_target": 0.0,
 }
 
-STEPS = Entry(int, 1, MAX_RULE)
-_RULE = Entry(float, 0.0, MAX_RULE)
-TASK = {"max_timesteps": STEPS, "dense_reward_scale": _RULE}
+STEPS = Entry(int, 1, MAX_STEPS)
+TASK = {"max_timesteps": STEPS, "dense_reward_scale": Entry(float, 0.0, MAX_REWARD_SCALE)}
 PHYSICS = {  # our name in physics.types.Params -> the reference's
     "dt": "dt",
     "slop": "slop",
@@ -187,4 +195,4 @@ PHYSICS = {  # our name in physics.types.Params -> the reference's
     "motor_limit_zone": "motor_joint_limit",
     "base_friction": "base_friction",
 }
-RULES = dict.fromkeys(PHYSICS, _RULE) | {"dt": Entry(float, 1e-6, 1.0)}  # s
+RULES = dict.fromkeys(PHYSICS, Entry(float, 0.0, MAX_CONSTANT)) | {"dt": Entry(float, MIN_DT, MAX_DT)}

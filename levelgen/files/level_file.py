@@ -73,8 +73,8 @@ def write_level_file(file: LevelFile, path: str | os.PathLike[str]) -> None:
     Files do not hold the rule `faithful_padding`: readers get the default, which is the reference's physics.
 
     Raises:
-        LevelFileError: a file cannot hold the level: it does not have exactly one lane, starts with contacts, or has
-            motors that run by themselves.
+        LevelFileError: a file cannot hold the level: it does not have exactly one lane, starts with contacts, has
+            motors that run by themselves, or a value that `read_level_file` refuses.
         OSError: the file cannot be written.
     """
     text = json.dumps(to_document(file)) + "\n"

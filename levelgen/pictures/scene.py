@@ -2,8 +2,8 @@
 
 Bodies are filled by role (grey plain, green, blue, red); bodies that cannot move are darker and hatched. A ring is
 a revolute joint, a crossed square a fixed one. A motor's ring has the colour of its binding, and an arrow while it
-runs; a thruster is a nozzle, with a flame while it fires. The row below shows the live entries of the action, M1 to M4
-for motors and T1, T2 for thrusters.
+runs; a thruster is a nozzle, with a flame while it fires. The row below shows the entries of the action that some
+motor or thruster obeys, M1 to M4 for motors and T1, T2 for thrusters.
 
 All scenes of a level have the same parts in the same order, so a film animates each part. Lengths are metres, y points
 up, angles are radians.

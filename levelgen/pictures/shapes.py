@@ -47,8 +47,9 @@ def polygon(
 
 def disc(centre: Point, radius: float, fill: Colour, edge: Colour, hatched: bool = False) -> str:
     """Draw a filled circle; its edge lies within the radius."""
-    circle = f'circle cx="{digits(centre[0])}" cy="{digits(centre[1])}" r="{digits(radius - EDGE / 2)}"'
-    return _filled(circle, fill, edge, EDGE, hatched)
+    width = min(EDGE, radius)
+    circle = f'circle cx="{digits(centre[0])}" cy="{digits(centre[1])}" r="{digits(radius - width / 2)}"'
+    return _filled(circle, fill, edge, width, hatched)
 
 
 def _filled(shape: str, fill: Colour, edge: Colour | None, width: float, hatched: bool) -> str:

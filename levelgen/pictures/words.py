@@ -58,9 +58,9 @@ def _fitted(words: str, room: float, size: float) -> str:
 
 
 def key_parts(level: Level, action: Int[np.ndarray, "6"]) -> list[Part]:
-    """Draw a key for each live entry, lit in its binding's colour while it is pressed."""
+    """Draw a key for each entry that some actuator obeys, lit in its binding's colour while it is pressed."""
     middle, left, parts = -style.FOOTER / 2, 0.04, []
-    for entry in live_entries(level):
+    for entry in obeyed_entries(level):
         is_motor = entry < MOTOR_BINDINGS
         name = f"M{entry + 1}" if is_motor else f"T{entry - MOTOR_BINDINGS + 1}"
         state = ("off", "forward" if is_motor else "on", "back")[int(action[entry])]
@@ -73,7 +73,7 @@ def key_parts(level: Level, action: Int[np.ndarray, "6"]) -> list[Part]:
     return parts
 
 
-def live_entries(level: Level) -> list[int]:
+def obeyed_entries(level: Level) -> list[int]:
     """Return the action entries of ONE level (no lane axis) that some motor or thruster obeys."""
     model = level.model
     motor = model.joint_active & ~model.joint_fixed & model.motor_on & ~level.motor_auto

@@ -95,9 +95,8 @@ class Distribution:
     def __post_init__(self) -> None:
         names = [field.name for field in fields(self)]
         require(self, [name for name in names if name.endswith("_chance")], 0, 1)
-        require(self, names, 0)
-        require(self, [field.name for field in fields(self) if field.type is float], 0, MAX_NUMBER)
-        require(self, [field.name for field in fields(self) if field.type is int], 0, 10**9)
+        require(self, names, 0)  # the error of a negative number need not name MAX_NUMBER
+        require(self, names, 0, MAX_NUMBER)
         require(self, ("proposals", "polygon_connections", "min_half_side", "min_radius"), 0, above=True)
         require(self, ("proposals",), 1, MAX_PROPOSALS)
         self._check_sums()

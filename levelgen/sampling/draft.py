@@ -98,7 +98,6 @@ class Body(NamedTuple):
     role: Int[Array, " lane"]
     inverse_mass: Float[Array, " lane"]
     position: Vec
-    rotation: Float[Array, " lane"]
     cos: Float[Array, " lane"]
     sin: Float[Array, " lane"]
     low: Vec
@@ -114,7 +113,6 @@ def read_body(draft: Draft, i: Scalar) -> Body:
         rows.role[i],
         rows.inverse_mass[i],
         pair(rows.position),
-        rows.rotation[i],
         *pair(notes.cos_sin),
         pair(notes.low),
         pair(notes.high),

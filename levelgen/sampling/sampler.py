@@ -46,8 +46,8 @@ def sample_levels(level_ids: ArrayLike, size: Size | str, distribution: Distribu
         distribution: the distribution of random levels.
 
     Raises:
-        ValueError: the size's name is unknown, or it has no room for the scenery, a green and a blue body; an id is
-            not 0 .. MAX_LEVEL_ID; or `jax_enable_x64` is on.
+        ValueError: the size's name is unknown, or it has no room for the scenery, a green and a blue body; the ids are
+            no list of integers, or one is not 0 .. MAX_LEVEL_ID; or `jax_enable_x64` is on.
     """
     require_32_bits()
     size = size_of(size)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from levelproof.levelgen.level import ACTIONS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Level
+from levelproof.levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, Level
 
 MOTOR_CHOICES = 3
 THRUSTER_CHOICES = 2
@@ -69,6 +69,5 @@ def action_mask(level: Level) -> Bool[Array, "6 lane"]:
     free = model.joint_active & ~model.joint_fixed
     live = [(free & (level.motor_binding == k)).any(0) for k in range(MOTOR_BINDINGS)]
     live += [(model.thruster_active & (level.thruster_binding == k)).any(0) for k in range(THRUSTER_BINDINGS)]
-    assert len(live) == ACTIONS
-    stack: Any = np.stack if isinstance(free, np.ndarray) else jnp.stack  # numpy for readers without JAX
+    stack: Any = np.stack if isinstance(free, np.ndarray) else jnp.stack  # of numpy arrays JAX would compile each shape
     return stack(live)

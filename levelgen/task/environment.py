@@ -71,7 +71,7 @@ class EnvState:
 
     level: Level  # with the present state of its world
     timestep: Int[Array, ""]  # env steps taken in this episode
-    last_distance: Float[Array, ""]  # m, between green and blue; NO_DISTANCE at the start
+    last_distance: Float[Array, ""]  # m, between green and blue, summed over pairs; NO_DISTANCE at the start
     level_index: Int[Array, ""]  # into `params.levels`, or a Sampler's level id, or into the levels of `starts`
     episode: Int[Array, ""]  # automatic resets since `reset`; an override state brings its own count
 
@@ -92,6 +92,17 @@ class EnvState:
         now = task.reset(level)
         count = lambda x: jnp.broadcast_to(jnp.asarray(x, jnp.int32), now.timestep.shape)
         return EnvState(level, now.timestep, now.last_distance, count(level_index), count(episode))
+
+
+def info_of(result: task.StepResult, end: task.StepEnd, level_index: Int[Array, "..."]) -> dict[str, Any]:
+    """Return the entries of `info` that `Environment.step` describes, but for the final observation."""
+    return {
+        "GoalR": result.goal,
+        "distance": end.distance,
+        "terminated": end.terminated,
+        "truncated": result.done & ~end.terminated,
+        "level_index": level_index,
+    }
 
 
 Step = tuple[Any, EnvState, Float[Array, ""], Bool[Array, ""], dict[str, Array]]
@@ -201,7 +212,7 @@ class Environment:
 
         Entries of `info`:
             GoalR: whether green touched blue.
-            distance: between green and blue at the end of the step, m.
+            distance: between green and blue at the end of the step, summed over pairs, m.
             terminated: whether the task ended the episode; the value of the next state is then 0.
             truncated: whether the time limit ended it; a value function bootstraps from the final observation.
             level_index: index of the step's level in `params.levels`, or its id (as `EnvState.level_index`).
@@ -282,8 +293,7 @@ class Environment:
         driven = CONTROLS[self.action_type](state.level, action)
         now, result, closing, _ = task.advance_driven(state.level, state.now, driven, self.rules)
         after = state.with_task_state(now)
-        info = {"GoalR": result.goal, "distance": closing.distance, "terminated": closing.terminated}
-        info |= {"truncated": result.done & ~closing.terminated, "level_index": state.level_index}
+        info = info_of(result, closing, state.level_index)
         if self.final_observation:
             info["final_observation"] = self._observe(after)
         if override is None and isinstance(levels, Sampler):

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.sampling.sampler import FRESH_IDS, Sampler
 from levelproof.levelgen.task import rules as task
-from levelproof.levelgen.task.environment import CONTROLS, Environment, EnvParams
+from levelproof.levelgen.task.environment import CONTROLS, Environment, EnvParams, info_of
 from levelproof.levelgen.task.fresh import renewed
 from levelproof.levelgen.task.observe.kinds import constant_features, observe
 from levelproof.levelgen.task.rules import TaskState
@@ -125,8 +125,7 @@ class Lanes:
         state, action = jax.lax.stop_gradient((state, action))
         driven = CONTROLS[env.action_type](level, action)
         now, result, closing, _ = task.advance_driven(level, state.now, driven, env.rules)
-        info = {"GoalR": result.goal, "distance": closing.distance, "terminated": closing.terminated}
-        info |= {"truncated": result.done & ~closing.terminated, "level_index": state.level_index}
+        info = info_of(result, closing, state.level_index)
         after = replace(state, now=now)
         if env.final_observation:
             info["final_observation"] = self.observe(after, played)

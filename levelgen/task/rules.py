@@ -48,7 +48,7 @@ class TaskState:
 
     state: State
     timestep: Int[Array, " lane"]  # env steps taken in this episode
-    last_distance: Float[Array, " lane"]  # m, between green and blue; NO_DISTANCE at the start
+    last_distance: Float[Array, " lane"]  # m, between green and blue, summed over pairs; NO_DISTANCE at the start
 
 
 class StepResult(NamedTuple):
@@ -62,7 +62,7 @@ class StepResult(NamedTuple):
 class StepEnd(NamedTuple):
     """The end of an env step, before any reset."""
 
-    distance: Float[Array, " lane"]  # between green and blue, m
+    distance: Float[Array, " lane"]  # between green and blue, summed over pairs, m
     terminated: Bool[Array, " lane"]  # by the task, not by the time limit alone: the next state's value is 0
 
 

@@ -42,7 +42,7 @@ class Batch:
         observation: of the requested type, [batch, time, ...] (`symbolic_flat`: float32 [batch, time,
             feature]); None if none was requested.
         action: multi-discrete codes (`levelgen.task.actions`), int32 [batch, time, 6].
-        action_mask: entries of an action that can have an effect in the level, bool [batch, time, 6].
+        action_mask: entries of an action to which an unfixed joint or a thruster is bound, bool [batch, time, 6].
         reward: float32 [batch, time].
         done: whether the step ended its episode, bool [batch, time].
         terminated: whether the task ended it, so that the value of what follows is 0, bool [batch, time].

@@ -45,7 +45,7 @@ class EpisodeBatch:
         observation: of the requested type, [row, ...] (`symbolic_flat`: float32 [row, feature]); None if none was
             requested.
         action: multi-discrete codes (`levelgen.task.actions`), int32 [row, 6].
-        action_mask: entries of an action that can have an effect in the level, bool [row, 6].
+        action_mask: entries of an action to which an unfixed joint or a thruster is bound, bool [row, 6].
         reward: float32 [row].
         done: whether the row is the last of its episode, bool [row].
         fields: the other requested fields by name: `level/` fields [episode, ...], `record/` fields [row, ...].

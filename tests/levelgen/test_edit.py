@@ -2,6 +2,7 @@
 
 import math
 from contextlib import suppress
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -28,7 +29,7 @@ from levelproof.levelgen.files.level_file import LevelFile, from_document, to_do
 from levelproof.levelgen.level import SIZES, Level, Role
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.sampling.scenery import empty_level
-from levelproof.levelgen.task.rules import TaskParams
+from levelproof.levelgen.task.rules import TaskParams, advance, reset
 
 M = SIZES["m"]
 FIRST = 4  # the first polygon that is not scenery
@@ -114,6 +115,15 @@ def test_set_role_and_fix_change_one_body() -> None:
     assert one.model.inverse_mass[FIRST] == 0
     assert bodies_at(level, 2.2, 2.2) == [M.polygons, FIRST]  # immovable bodies are drawn first
     assert one_of(fix(level, FIRST, False)).model.inverse_mass[FIRST] == pytest.approx(4)
+
+
+def test_fixed_body_stays_where_it_is_even_if_it_moved() -> None:
+    level = add_body(empty(), "rectangle", 2, 2)
+    moving = replace(level.state, velocity=level.state.velocity + 1, angular_velocity=level.state.angular_velocity + 1)
+    still = fix(replace(level, state=moving), FIRST, True)
+    after = advance(still, reset(still), np.zeros((6, 1), np.int32), TaskParams())[0].state
+    np.testing.assert_array_equal(after.position[FIRST], still.state.position[FIRST])
+    np.testing.assert_array_equal(after.rotation[FIRST], still.state.rotation[FIRST])
 
 
 @pytest.mark.parametrize(

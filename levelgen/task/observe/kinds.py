@@ -37,7 +37,7 @@ OF_LEVEL_AND_STATE = {
 }
 
 
-def constant_features(kind: ObservationType | None, level: Level) -> Float[Array, "feature lane"]:
+def constant_features(kind: ObservationType, level: Level) -> Float[Array, "feature lane"]:
     """Return the part of an observation that is constant within a level; no rows for kinds that have none."""
     if kind == ObservationType.SYMBOLIC_FLAT:
         return level_features(level)

@@ -43,7 +43,7 @@ class Episode(NamedTuple):
     terminations: Bool[np.ndarray, " step"]  # green touched blue or red
     truncations: Bool[np.ndarray, " step"]  # the time limit or the end of the record
     success: Bool[np.ndarray, " step"]  # green touched blue
-    action_mask: Bool[np.ndarray, "6"]  # entries of an action that have an effect in the level
+    action_mask: Bool[np.ndarray, "6"]  # entries of an action to which an unfixed joint or a thruster is bound
 
 
 def episodes_of(

@@ -10,7 +10,7 @@ from PIL import Image
 from levelproof.levelgen.level import WORLD_SIDE, Role
 from levelproof.levelgen.pictures.raster import draw, sheet, write_gif, write_png
 from levelproof.levelgen.pictures.style import BINDING_COLOUR, BORDER, HEADER, ROLE_COLOUR
-from levelproof.levelgen.pictures.words import Caption, live_entries
+from levelproof.levelgen.pictures.words import Caption, obeyed_entries
 from tests.golden.load import HERE, load
 
 OFF = np.zeros(6, np.int32)
@@ -119,10 +119,18 @@ def test_flame_points_opposite_to_the_force(golden) -> None:
     assert np.dot(middle - place, push) < -0.1
 
 
-def test_live_entries_have_an_effect(golden) -> None:
+def test_obeyed_entries_are_those_of_the_action_mask_but_for_motors_without_a_player(golden) -> None:
+    seen = set[int]()
     for lane in range(64):
         one = jax.tree.map(lambda x, lane=lane: x[..., lane], golden.level)
-        assert golden.action_mask[live_entries(one), lane].all()  # that mask counts motors that are off, too
+        obeyed, mask = obeyed_entries(one), np.flatnonzero(golden.action_mask[:, lane])
+        turns = one.model.joint_active & ~one.model.joint_fixed
+        if (one.model.motor_on & ~one.motor_auto)[turns].all():
+            assert obeyed == [*mask]
+            seen |= {*obeyed}
+        else:
+            assert {*obeyed} <= {*mask}
+    assert seen == {*range(len(OFF))}
 
 
 def test_picture_shows_its_caption(golden) -> None:

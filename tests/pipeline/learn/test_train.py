@@ -239,6 +239,7 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     ("words", "sentence"),
     [
         (["ppo.env_step=3"], "did you mean ppo.env_steps?"),
+        (["ppo.subsample=1.5"], "ppo.subsample is 1.5: it must be above 0 and at most 1"),
         (["ppo.repeat=257"], "ppo.repeat is 257: it must be between 1 and 256"),
         (["levels=learnabilty"], "There are no levels at learnabilty"),
         (["size=s", "levels=some/split"], "size has no effect"),
