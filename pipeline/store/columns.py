@@ -128,7 +128,8 @@ DESCRIBED = (
     ManifestColumn(
         "steps_to_first_success",
         pa.int64(),
-        "Training steps until the expert's first success, not counting environments with sticky actions",
+        "Training steps until the expert's first success, in environments where it alone acts (no persistence or "
+        "rehearsal)",
         "env steps",
         "never",
     ),
@@ -152,7 +153,7 @@ DESCRIBED = (
     ManifestColumn(
         "learning_curve",
         pa.list_(pa.float32()),
-        "Training success rate per update, in environments without sticky actions; an entry is null if no episode "
+        "Training success rate per update, in environments where the expert alone acts; an entry is null if no episode "
         "ended",
         "share",
     ),
