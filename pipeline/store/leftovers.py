@@ -48,7 +48,7 @@ def clean(split: Path, say: Callable[[str], None]) -> Manifest:
         begun = entries(split, MANIFEST, BEGUN, DirEntry.is_file)
         over = begun.keys()
         if is_remote(split):
-            over = ended(split, begun, {fragment.path for fragment in manifest.counting})
+            over = ended(split, begun, named)
         dead = [path for path in unnamed if begun_path(path) in over]
         for path in dead:
             remove_data(path)

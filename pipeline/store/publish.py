@@ -1,10 +1,11 @@
 """Attempts at units of a split in an object store: written to a local folder, then uploaded, the fragment last.
 
-An attempt (1) writes its mark, (2) reads its fragment's path, where it expects no file or a fence (a fragment without
-rows), (3) checks that its writer still has the lease, (4) writes its data, and (5) writes its fragment, if the path
-still has what (2) found. A writer that has taken the lease lists marks, and writes a new fence for each unit with a
-mark but no commit. So no attempt of an earlier writer can commit after that: either its mark was listed, and (5) finds
-a new fence; or the mark came later, and (3) finds another lease.
+An attempt (1) writes its mark, (2) reads its fragment's path, where it expects no file, a fence (a fragment without
+rows) or, to seal, a fragment that it replaces, (3) checks that its writer still has the lease, (4) writes its data, and
+(5) writes its fragment, if the path still has what (2) found. A writer that has taken the lease lists marks. At the
+path of each whose data no fragment names, it writes a new fence, or what is committed there in other bytes. So no
+attempt of an earlier writer can commit after that: either its mark was listed, and (5) finds other bytes; or the mark
+came later, and (3) finds another lease.
 """
 
 import secrets
@@ -20,6 +21,7 @@ from levelproof.configs.schema import hash_of
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.bounds import DAMAGE
 from levelproof.pipeline.store.files import remove_data
+from levelproof.pipeline.store.formats import FENCE_KEY
 from levelproof.pipeline.store.fragment import read_fragment
 from levelproof.pipeline.store.layout import (
     MANIFEST,
@@ -31,7 +33,14 @@ from levelproof.pipeline.store.layout import (
     unit_name,
 )
 from levelproof.pipeline.store.leases import LeaseLost, require_served
-from levelproof.pipeline.store.manifest import begin_fragment, fragment_paths, write_fragment
+from levelproof.pipeline.store.manifest import (
+    DATA_COLUMNS,
+    begin_fragment,
+    bytes_of_fragment,
+    data_named_by,
+    fragment_paths,
+    write_fragment,
+)
 from levelproof.pipeline.store.objects import Version, get, put, put_if, remove
 from levelproof.pipeline.store.remote import at_once, fragments_in, is_remote
 from levelproof.pipeline.store.scratch import scratch
@@ -77,7 +86,7 @@ def _upload(folder: Path, split: Path, replaced: Collection[Path]) -> None:
     remove(marks)
     if not committed.ids or replaced:
         raise LeaseLost(split)
-    if not _ids(fragment.read_bytes()) <= committed.ids:
+    if not _ids(pq.read_table(fragment, columns=["level_id"])) <= committed.ids:
         raise Failure(f"Another attempt was committed first as {theirs}, without some of the levels of this one.")
 
 
@@ -96,46 +105,63 @@ def committed_levels(split: Path, unit: str) -> frozenset[int]:
         return frozenset()
 
 
-def ended(split: Path, marks: Iterable[Path], committed: Collection[Path]) -> set[Path]:
-    """Return the marks of attempts that can no longer commit; `committed` are fragments that count.
+def ended(split: Path, marks: Iterable[Path], named: Iterable[str]) -> set[Path]:
+    """Return the marks of attempts that have committed `named` data, or can no longer commit.
 
     Raises:
         UserError, StoreFailure: the store's request fails.
     """
-    about = fragments_in(split / MANIFEST)
-    over, by_fragment = {mark for mark in marks if mark in about and about[mark].size}, dict[Path, set[Path]]()
+    about, done = fragments_in(split / MANIFEST), {begun_path(split / name) for name in named}
+    over = {mark for mark in marks if mark in done or (mark in about and about[mark].size)}
+    by_fragment = dict[Path, set[Path]]()
     for mark in set(marks) - over:
         by_fragment.setdefault(fragment_path(split, attempt_of(mark).rpartition("-")[0]), set()).add(mark)
-    barred = at_once(split, lambda fragment: fragment in committed or _barred(fragment), by_fragment)
-    return over.union(*(group for group, bar in zip(by_fragment.values(), barred, strict=True) if bar))
+    barred = at_once(split, lambda one: _barred(split, *one), by_fragment.items())
+    return over.union(*barred)
 
 
-def _barred(fragment: Path) -> bool:
-    """Write a fence unless the unit is committed; return whether that succeeded before any other write."""
+def _barred(split: Path, fragment: Path, marks: set[Path]) -> set[Path]:
+    """Change the bytes at a fragment's path; return the marks of attempts that can no longer commit there.
+
+    These are none if another write came first. Attempts whose data is named there have committed by now.
+    """
     committed = _at(fragment)
-    return not committed.ids and put_if(fragment, _fence(), committed.version) is not None
+    data = _renewed(committed.data) if committed.ids else _fence()
+    if put_if(fragment, data, committed.version) is None:
+        return set()
+    return marks - {begun_path(split / name) for name in committed.named}
 
 
 class _Committed(NamedTuple):
-    """Level ids and version of the object at a fragment's path."""
+    """The object at a fragment's path."""
 
-    ids: frozenset[int]  # empty for a fence or a missing file
-    version: Version | None
+    ids: frozenset[int] = frozenset()  # of its levels; empty for a fence or a missing file
+    named: frozenset[str] = frozenset()  # its shards and experts
+    version: Version | None = None
+    data: bytes = b""
 
 
 def _at(fragment: Path) -> _Committed:
     try:
         file = get(fragment)
     except FileNotFoundError:
-        return _Committed(frozenset(), None)
+        return _Committed()
     try:
-        return _Committed(_ids(file.data), file.version)
+        rows = pq.read_table(pa.BufferReader(file.data), columns=["level_id", *DATA_COLUMNS])
+        return _Committed(_ids(rows), data_named_by(rows), file.version, file.data)
     except DAMAGE:
         raise Failure(f"The fragment {fragment} is damaged: remove it, and run the same command again.") from None
 
 
-def _ids(data: bytes) -> frozenset[int]:
-    return frozenset(pq.read_table(pa.BufferReader(data), columns=["level_id"])["level_id"].to_pylist())
+def _ids(rows: pa.Table) -> frozenset[int]:
+    return frozenset(rows["level_id"].to_pylist())
+
+
+def _renewed(data: bytes) -> bytes:
+    """Return a fragment with the same rows and metadata, and different bytes each time."""
+    table = pq.read_table(pa.BufferReader(data))
+    metadata = (table.schema.metadata or {}) | {FENCE_KEY: secrets.token_bytes(8)}
+    return bytes_of_fragment(table.replace_schema_metadata(metadata))
 
 
 def _fence() -> bytes:

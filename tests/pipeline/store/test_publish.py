@@ -26,13 +26,22 @@ from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import failure
 from levelproof.pipeline.store import leases, machine, remote
 from levelproof.pipeline.store.event_files import KEPT, events_of, new_run, runs_in, write_events
-from levelproof.pipeline.store.layout import FRAGMENT, WRITER_LOCK, data_paths, new_attempt, unit_name
+from levelproof.pipeline.store.layout import (
+    FRAGMENT,
+    WRITER_LOCK,
+    begun_path,
+    data_paths,
+    fragment_path,
+    new_attempt,
+    unit_name,
+)
 from levelproof.pipeline.store.leases import Lease, LeaseLost
 from levelproof.pipeline.store.leftovers import clean
 from levelproof.pipeline.store.locks import is_written
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.objects import get, put, remove, require_conditions
 from levelproof.pipeline.store.publish import ended
+from levelproof.pipeline.store.seal import Piece, seal
 from levelproof.pipeline.store.split import locked
 from levelproof.pipeline.verify import verify
 from tests.pace import patience, wait_until
@@ -192,7 +201,7 @@ STEPS = {  # requests of an attempt: text that a request's line in the log conta
     "mark": ("begun", 1),
     "look": (".parquet", 2),  # the first checks for an unreported commit
     "lease": (".writer.lock", 1),
-    "data": ("/shards/", 1),
+    "data": ("PUT /bucket/data/128k/s/shards/", 1),
     "fragment": ("PUT /bucket/data/128k/s/manifest/0", 1),
     "end": ("POST", 1),
 }
@@ -244,6 +253,33 @@ def test_seal_preserves_a_split_in_a_store(server: Server, here: Path, tmp_path:
     assert done.returncode == 0, done.stderr
     assert "merged 3 fragments into 1" in done.stdout
     assert_sealed(here)
+
+
+@pytest.mark.slow
+@ALSO_MOTO
+@pytest.mark.parametrize("request_of", ["fragment", pytest.param("data", marks=pytest.mark.campaign)])
+def test_seal_of_a_replaced_writer_commits_nothing(
+    server: Server, here: Path, monkeypatch: pytest.MonkeyPatch, request_of: str
+) -> None:
+    """It pauses before it overwrites a fragment of the same name, until another writer has taken over."""
+    monkeypatch.setattr(leases, "RENEWAL", 1000.0)
+    monkeypatch.setattr(leases, "SILENCE", -1.0)
+    drive(OUT)
+    piece, (text, number), theirs = Piece.of(read_manifest(THERE).fragments[0]), STEPS[request_of], list[Lease]()
+    with leases.leased(THERE, print):
+        begun = server.count
+
+        def meanwhile(count: int) -> None:
+            if sum(text in line for line in server.log[begun:count]) == number:
+                server.meanwhile = lambda _: None
+                theirs.append(taken_over(THERE))
+
+        server.meanwhile = meanwhile
+        with pytest.raises(LeaseLost, match="has taken over s3://bucket/data/128k/s"):
+            seal(THERE, [piece])
+    theirs[0].release()
+    forget()
+    require_whole(here)
 
 
 @pytest.mark.campaign
@@ -562,8 +598,13 @@ def test_fences_are_invisible_to_readers_and_replaced_by_units(server: Server, h
     assert ended(THERE, [mark], []) == {mark}  # another fence
     assert not read_manifest(THERE).fragments
     commit_made(THERE, WorkUnit((0, 1)))
-    assert ended(THERE, [mark], []) == set()
+    before = get(fragment := fragment_path(THERE, unit_name(0, 1))).data
+    assert ended(THERE, [mark], []) == {mark}
+    assert get(fragment).data != before
     assert read_manifest(THERE).level_ids.tolist() == [0, 1]
+    (shard,) = data_paths(THERE)
+    assert ended(THERE, [begun_path(shard)], []) == set()  # committed after the caller's look
+    assert ended(THERE, [begun_path(shard)], [f"shards/{shard.name}"]) == {begun_path(shard)}
     drive(OUT)
     require_whole(here)
 
