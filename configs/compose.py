@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 from itertools import product
+from threading import Lock
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from hydra import compose, initialize_config_module
@@ -37,6 +38,7 @@ NOT_COPIED = frozenset({"size", "distribution", "budget", "sampler_version", "en
 # Values are taken as strings: 007 stays 007
 VERBATIM = frozenset({"size", "levels", "level_files", "budget", "out", "continue_from", "where", "start"})
 FOLDERS = ("procedure", "distribution")  # folders of presets
+COMPOSING = Lock()  # Hydra's state is global: threads compose one after another
 FOR_RANDOM_LEVELS = ("size", "levels", "first_level", "distribution")
 
 
@@ -70,7 +72,7 @@ def _known() -> Mapping[str, Any]:
 @cache
 def default_presets() -> dict[str, str]:
     """Return the default preset of each folder of configs/."""
-    with initialize_config_module(PACKAGE, version_base="1.3"):
+    with COMPOSING, initialize_config_module(PACKAGE, version_base="1.3"):
         choices = compose(JOB, return_hydra_config=True).hydra.runtime.choices
     return {name: str(choices[name]) for name in presets()}
 
@@ -154,7 +156,7 @@ def name_and_hash(distribution: Distribution) -> tuple[str | None, str]:
 
 def _compose(overrides: list[str]) -> dict[str, Any]:
     try:
-        with initialize_config_module(PACKAGE, version_base="1.3"):
+        with COMPOSING, initialize_config_module(PACKAGE, version_base="1.3"):
             composed = OmegaConf.to_container(compose(JOB, overrides), resolve=True)
     except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(f"cannot use these settings: {str(error).splitlines()[0].rstrip('.')}.") from None

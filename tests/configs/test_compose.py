@@ -2,6 +2,7 @@
 
 import dataclasses
 import shlex
+from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
 
 import pytest
@@ -11,6 +12,7 @@ from omegaconf import OmegaConf
 
 from levelproof.configs.compose import (
     FOLDERS,
+    _default,
     changed_settings,
     compose_job,
     default_presets,
@@ -209,6 +211,15 @@ def test_shortest_command_reproduces_the_results(overrides: list[str]) -> None:
     arguments = shlex.split(shortest_command(job))
     assert arguments[:2] == ["levelproof", "generate"]
     assert compose_job(arguments[2:]).results == job.results
+
+
+def test_threads_compose_side_by_side() -> None:
+    """Workers in threads of one process ask for the commands of their rows, and Hydra's state is global."""
+    for cached in (_default, default_presets, shortest_command):
+        cached.cache_clear()
+    with ThreadPoolExecutor(4) as threads:
+        commands = {*threads.map(lambda width: shortest_command(compose_job([f"expert.width={width}"])), range(8, 24))}
+    assert len(commands) == 16
 
 
 def test_shortest_command_names_presets() -> None:
