@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,6 +43,7 @@ from levelproof.pipeline.store.remote import at_once, is_remote, mended, stored_
 FORMAT = "levelproof.shard"
 # What reading untrusted bytes can raise
 DAMAGE = (OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, MemoryError, OverflowError)
+WRITING = Lock()  # zarr's settings are global: threads write one after another
 COMPRESSION: dict[str | None, dict[str, Any]] = {  # by array; None: all others
     FLAT: {"clevel": 9, "shuffle": "noshuffle"},  # a few kilobytes per level, of mixed types
     # Level 9 would save 2% but encode at 3 MB/s; one block per chunk saves 1%
@@ -75,7 +77,7 @@ def write_shard(
         **encoding.as_json(),
         "fields": [field.as_json() for field in table],
     }
-    with zarr.config.set({"json_indent": None}):  # half of a small shard would be blanks
+    with WRITING, zarr.config.set({"json_indent": None}):  # half of a small shard would be blanks
         group = zarr.create_group(path, attributes=attributes)
         for name, values in pack(stored, table).items():
             if name == FLAT:

@@ -1,5 +1,6 @@
 """Shards: every bit is restored, damage is detected, and only requested arrays are read."""
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +85,15 @@ def test_shards_are_plain_zarr(shard: Path) -> None:
     assert {name for name, _ in group.arrays()} == {"dyn32", "dyn8", "act", "lvl32", "lvl8"}
     assert group["act"].shape == (len(LEVELS), 6, RECORD_STEPS)  # type: ignore[union-attr]
     assert group.attrs["format"] == "levelproof.shard"
+
+
+def test_threads_write_the_same_bytes_as_one(shard: Path, fields: dict[str, np.ndarray], tmp_path: Path) -> None:
+    others = [tmp_path / f"{number}" / shard.name for number in range(12)]
+    with ThreadPoolExecutor(len(others)) as threads:
+        list(threads.map(lambda path: write_shard(path, LEVELS, fields), others))
+    contents = lambda path: {file.relative_to(path): file.read_bytes() for file in path.rglob("*") if file.is_file()}
+    for other in others:
+        assert contents(other) == contents(shard)
 
 
 def test_write_shard_never_overwrites(shard: Path, fields: dict[str, np.ndarray]) -> None:
