@@ -37,7 +37,10 @@ class Failure(LevelproofError):
 
 
 class StoreFailure(LevelproofError):
-    """A store does not answer, or rejects a request. Not a `Failure`, which readers take for damaged data."""
+    """A store does not answer or rejects a request, or the cache has no room for what it sends.
+
+    Not a `Failure`, which readers take for damaged data.
+    """
 
 
 def last_line(error: Exception) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import google_crc32c
 
-from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.errors import StoreFailure
 from levelproof.pipeline.store.disk import NotRegular, regular, write_new
 
 CHECKSUM = 4  # bytes of a CRC-32C after each piece: a loss of power can leave other bytes
@@ -62,7 +62,7 @@ class PieceCache:
         """Add a piece, which appears whole or not at all.
 
         Raises:
-            Failure: the folder cannot be written.
+            StoreFailure: the folder cannot be written.
         """
         temporary = self.folder / f".{name}.{secrets.token_hex(4)}"
         try:
@@ -72,7 +72,7 @@ class PieceCache:
         except OSError as error:
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
-            raise Failure(
+            raise StoreFailure(
                 f"Cannot write to the cache folder {self.folder} ({error.strerror or error}): "
                 "make room there, or set LEVELPROOF_CACHE_DIR to another folder."
             ) from None
@@ -80,7 +80,8 @@ class PieceCache:
         self._added += len(piece) + CHECKSUM
         if self._added > self.most // PARTS:
             self._added = 0
-            make_room(self.folder, self.most)
+            with suppress(OSError):  # such as a folder that another process has deleted
+                make_room(self.folder, self.most)
 
 
 def make_room(folder: Path, most: int) -> None:

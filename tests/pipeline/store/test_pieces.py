@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.errors import StoreFailure
 from levelproof.pipeline.store.pieces import CHECKSUM, PARTS, PieceCache
 
 MAX_LENGTH = 40  # bytes of a piece
@@ -87,5 +87,5 @@ def test_piece_cache_reads_a_folder_that_it_cannot_write(tmp_path: Path, monkeyp
 
 def test_piece_cache_explains_an_unwritable_folder(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(Failure, match=r"Cannot write to the cache folder .* LEVELPROOF_CACHE_DIR"):
+    with pytest.raises(StoreFailure, match=r"Cannot write to the cache folder .* LEVELPROOF_CACHE_DIR"):
         PieceCache(tmp_path / "file" / "cache", 100).put("name", b"x")
