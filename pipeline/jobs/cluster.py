@@ -257,7 +257,7 @@ class Crew:
         """Pass a round to the scheduler and the board; return its outcomes."""
         handle.heard += 1
         self._scheduler.report(handle, round, time.monotonic())
-        self._board.tally.follow(round)
+        self._board.follow(round)
         if round.leaves:
             self._scheduler.leave(handle)
             handle.end()

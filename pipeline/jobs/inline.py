@@ -55,7 +55,7 @@ def _work(
 
     def report(handle: Handle, round: Round) -> None:
         scheduler.report(handle, round, time.monotonic())
-        board.tally.follow(round)
+        board.follow(round)
         settle(round.outcomes)
 
     def begin(handle: Handle) -> Future[Round] | None:

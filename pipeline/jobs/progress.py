@@ -102,6 +102,7 @@ class Board:
         self._steps = self._pace.add_task("env steps", total=None)
         self._levels = self._pace.add_task("levels", total=tally.levels, completed=tally.done)
         self._paced_at = -PACE_EVERY
+        self._unsaved = False  # whether the user knows that experts could not be saved
         self.watchers: list[Callable[[float, float | None], None]] = []  # get env steps/s and s to go, at each refresh
 
     def shown(self) -> AbstractContextManager[object]:
@@ -126,6 +127,13 @@ class Board:
     def say(self, text: str) -> None:
         """Print a permanent line."""
         say(self._console, text)
+
+    def follow(self, round: Round) -> None:
+        """Pass a worker's round to the tally; say once if its experts cannot be saved."""
+        self.tally.follow(round)
+        if round.unsaved and not self._unsaved:
+            self.say(f"Unfinished experts cannot be saved ({round.unsaved}): if this run is stopped, they start again.")
+            self._unsaved = True
 
     def ended(self, unit: WorkUnit, summary: Summary | None) -> None:
         """Pass an attempt to the tally, and show the new numbers if it committed levels."""

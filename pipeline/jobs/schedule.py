@@ -133,6 +133,7 @@ class Round:
     spare: int = 0  # unstarted levels
     cuts: list[Cut] = field(default_factory=list)  # units from which it has given levels back
     leaves: bool = False  # the worker ends now; it has committed what it could
+    unsaved: str = ""  # why unfinished experts could not be saved lately
 
 
 @dataclass(frozen=True)

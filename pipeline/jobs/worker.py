@@ -3,7 +3,6 @@
 The same code runs in this process and in a Ray worker, and knows nothing of either.
 """
 
-import contextlib
 import time
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
@@ -11,7 +10,7 @@ from pathlib import Path
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.ledger import Lap
 from levelproof.experts.pool.run import TrainingRun
-from levelproof.pipeline.errors import LevelproofError
+from levelproof.pipeline.errors import LevelproofError, last_line
 from levelproof.pipeline.jobs.schedule import Cut, Order, Round, UnitOutcome, WorkUnit
 from levelproof.pipeline.jobs.unit import begin_unit, failure, finish_unit, pool_for
 from levelproof.pipeline.store.paused import save_paused
@@ -25,6 +24,7 @@ class Worker:
         self.pool = pool_for(job)
         self._runs: dict[WorkUnit, TrainingRun] = {}
         self._keep_at = time.monotonic() + job.checkpoint_seconds
+        self._unsaved = ""  # why the last save failed
         self.compiling = 0.0  # s of compiling before any unit came, charged to the first one
         self.stopping = False  # set by the executor to make the worker leave after the current step
 
@@ -47,7 +47,8 @@ class Worker:
         # Plain tuples, because the driver imports no JAX
         plain = {unit: (run.env_steps, run.levels, run.solved) for unit, run in now.items()}
         wants = self.pool.wants(sum(run.searching for run in self._runs.values()))
-        return Round(outcomes, plain, wants, sum(len(run.unbegun) for run in self._runs.values()), cuts)
+        spare = sum(len(run.unbegun) for run in self._runs.values())
+        return Round(outcomes, plain, wants, spare, cuts, unsaved=self._unsaved)
 
     def leave(self, outcomes: Sequence[UnitOutcome] = (), cuts: Sequence[Cut] = ()) -> Round:
         """Commit the decided levels of all running units, and cut off the undecided ones."""
@@ -55,19 +56,21 @@ class Worker:
             self._keep()
         last = [self._cut(unit, run.undecided) for unit, run in list(self._runs.items())]
         ended = [self._finish(unit) for unit in list(self._runs)]
-        return Round([*outcomes, *ended], {}, 0, cuts=[*cuts, *last], leaves=True)
+        return Round([*outcomes, *ended], {}, 0, cuts=[*cuts, *last], leaves=True, unsaved=self._unsaved)
 
     def _keep(self) -> None:
         """Save unfinished experts beside the split, so that whichever worker gets their levels next resumes them.
 
-        A save that fails is retried at the next interval.
+        A save that fails is reported, and retried at the next interval.
         """
-        self._keep_at = time.monotonic() + self._job.checkpoint_seconds
+        self._keep_at, self._unsaved = time.monotonic() + self._job.checkpoint_seconds, ""
         in_slots = list(self.pool.paused())
         for unit, run in self._runs.items():
             if paused := run.paused(in_slots):
-                with contextlib.suppress(OSError, LevelproofError):
+                try:
                     save_paused(self._split, unit.name, paused, self._job)
+                except (OSError, LevelproofError) as error:
+                    self._unsaved = last_line(error)
 
     def _give(self, levels: int) -> list[Cut]:
         """Give back up to `levels` levels that have not begun, from the latest units first."""

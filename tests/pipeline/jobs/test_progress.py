@@ -7,7 +7,7 @@ from rich.console import Console
 
 from levelproof.experts.steps import EnvSteps
 from levelproof.pipeline.jobs.progress import Board, Tally
-from levelproof.pipeline.jobs.schedule import Summary, WorkUnit
+from levelproof.pipeline.jobs.schedule import Round, Summary, WorkUnit
 from levelproof.pipeline.words import duration, number
 
 UNIT = WorkUnit(tuple(range(16)))
@@ -123,6 +123,15 @@ def test_board_prints_a_commit_once_the_last_line_is_old(monkeypatch: pytest.Mon
     board.refresh()
     board.ended(UNIT, Summary(16, 5, EnvSteps(trained=16_000)))
     assert "16/64 levels · 5 solved" in text.getvalue().splitlines()[1]
+
+
+def test_board_says_once_that_experts_cannot_be_saved() -> None:
+    text = io.StringIO()
+    board = Board(tally(), Console(file=text))
+    for why in ("", "no space", "no space"):
+        board.follow(Round([], {}, 0, unsaved=why))
+    (line,) = text.getvalue().splitlines()
+    assert line == "Unfinished experts cannot be saved (no space): if this run is stopped, they start again."
 
 
 def test_tally_text_says_writing_until_all_levels_are_committed() -> None:

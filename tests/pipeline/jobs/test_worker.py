@@ -184,6 +184,22 @@ def test_worker_resumes_experts_that_another_saved(tmp_path: Path, job: JobConfi
     assert not path.exists()
 
 
+def test_worker_reports_experts_that_it_cannot_save(
+    tmp_path: Path, job: JobConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> None:
+        raise OSError(errno.EACCES, "Permission denied", "checkpoints")
+
+    monkeypatch.setattr(worker_module, "save_paused", fail)
+    worker, unit = Worker(replace(job, search=SearchConfig(env_steps=0), checkpoint="1h"), tmp_path), WorkUnit(range(8))
+    round = worker.work(Order([unit]), 0.0)
+    while not round.totals[unit][0]:
+        assert not round.unsaved
+        round = worker.work(Order([]), 0.01)
+    worker.stopping = True
+    assert worker.work(Order([]), 60.0).unsaved == "[Errno 13] Permission denied: 'checkpoints'"
+
+
 @pytest.mark.parametrize("mode", [0o600, 0o666])
 def test_unreadable_checkpoint_is_fatal(tmp_path: Path, job: JobConfig, mode: int) -> None:
     path = checkpoint_path(tmp_path, UNITS[0].name)
