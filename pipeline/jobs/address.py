@@ -42,6 +42,9 @@ def require_reachable(address: str) -> None:
             raise no_cluster(getattr(error, "strerror", None) or str(error)) from error
 
 
+MISMATCH = "Version mismatch:"  # how Ray's error begins if a cluster has another Ray or Python
+
+
 def no_cluster(reason: str) -> UserError:
     return UserError(
         f"There is no Ray cluster at RAY_ADDRESS={ray_address()} ({reason.rstrip('.')}): "
@@ -54,6 +57,12 @@ def cannot_start(error: Exception) -> LevelproofError | None:
     reason = (str(error).strip().splitlines() or ["no message"])[0]
     if isinstance(error, ConnectionError):
         return no_cluster(reason)
+    if isinstance(error, RuntimeError) and reason.startswith(MISMATCH):
+        versions = " ".join(str(error).removeprefix(MISMATCH).split())
+        return UserError(
+            f"The cluster at RAY_ADDRESS={ray_address()} has another Ray or Python than this command ({versions}): "
+            "install the same versions here, or start the cluster again from this environment."
+        )
     if isinstance(error, TimeoutError) or type(error) is Exception:  # Ray's time-outs are of either type
         return Failure(
             f"Ray cannot start ({reason.rstrip('.')}): run the same command again when this machine is less busy, or "

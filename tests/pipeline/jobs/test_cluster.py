@@ -91,6 +91,21 @@ def test_connected_explains_a_ray_that_starts_too_slowly(kind: type, monkeypatch
         pass
 
 
+def test_connected_explains_a_cluster_of_other_versions(monkeypatch: pytest.MonkeyPatch) -> None:
+    def init(**_: Any) -> None:
+        started, ours = "    Ray: 2.40.0\n    Python: 3.12.1", "    Ray: 2.50.0\n    Python: 3.11.7"
+        raise RuntimeError(
+            f"Version mismatch: The cluster was started with:\n{started}\nThis process on node 127.0.0.1 was started "
+            f"with:\n{ours}\n"
+        )
+
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setattr(cluster.ray, "init", init)
+    sentence = r"another Ray or Python than this command \(The cluster .* Ray: 2\.40\.0 .* Python: 3\.11\.7\): install"
+    with pytest.raises(UserError, match=sentence), cluster.connected():
+        pass
+
+
 @pytest.mark.campaign
 def test_workers_do_without_a_gpu_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
