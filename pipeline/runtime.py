@@ -6,11 +6,13 @@ Takes effect only before JAX starts its backend.
 import gc
 import multiprocessing
 import os
+import signal
 import socket
 import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -18,6 +20,7 @@ from typing import Any, Literal, TypeVar
 from loky import cpu_count
 
 from levelproof.pipeline.claims import share_compiling
+from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.owned import own_folder
 
 T = TypeVar("T")
@@ -177,11 +180,25 @@ def _allowed_cores() -> list[int]:
 
 
 def in_another_process(function: Callable[..., T], *arguments: Any) -> T:
-    """Run a function in another process: it starts JAX, and Ray forks this one. A stop ends that process."""
+    """Run a function in another process: it starts JAX, and Ray forks this one. A stop ends that process.
+
+    Raises:
+        Failure: that process died.
+    """
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-        answer = process.submit(function, *arguments)
+        # A terminal sends Ctrl-C to the child, too, which would print a traceback: it inherits this mask
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            answer = process.submit(function, *arguments)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         try:
             return answer.result()
+        except BrokenProcessPool:
+            raise Failure(
+                "A process of this command died, perhaps because memory ran out: free some, then run the same command "
+                "again."
+            ) from None
         except KeyboardInterrupt:  # SIGTERM reaches only this process
             for child in multiprocessing.active_children():
                 child.terminate()
