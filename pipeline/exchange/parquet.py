@@ -36,8 +36,9 @@ def export_parquet(split: Path, where: str | None, out: Path) -> None:
     other versions or another machine.
 
     Raises:
-        UserError: the split does not exist, the condition is invalid, no level meets it, or `out` exists.
-        Failure: the split is damaged, or a write fails.
+        UserError: the split does not exist, the condition is invalid, no level meets it, or `out` exists or cannot be
+            written.
+        Failure: the split is damaged.
     """
     manifest = require_manifest(split, columns_in(where), compact=True)
     ids = select_some(split, manifest.table, where).column("level_id").to_numpy()

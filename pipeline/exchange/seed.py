@@ -55,11 +55,12 @@ def export_seed(split: Path, where: str | None, out: Path, with_levels: bool = T
 
     Raises:
         UserError: the split does not exist, the condition is invalid, no level meets it, `out` exists or is not
-            named as seed files are, its settings are such that this program could not read the file, or levels that
-            come from ids or records should be left out.
-        Failure: the split is damaged, or a write fails.
+            named as seed files are or cannot be written, its settings are such that this program could not read the
+            file, or levels that come from ids or records should be left out.
+        Failure: the split is damaged.
     """
     check_new_seed(out)
+    prepare_jax()  # hashes are computed as conditions ask for them
     manifest = require_manifest(split, [*READ, *columns_in(where)], compact=True)
     rows = select_some(split, manifest.table, where)
     if not with_levels:
@@ -68,7 +69,6 @@ def export_seed(split: Path, where: str | None, out: Path, with_levels: bool = T
         rows = _without_folder(rows, split)
     config = {**(manifest.config or {}), **REPEATED}
     LevelSource.require_readable(config, split)
-    prepare_jax()
     with writing_to(out):
         firsts = with_bar(range(0, rows.num_rows, ROW_GROUP), "row groups")
         groups = (_group(manifest, rows.slice(first, ROW_GROUP), with_levels) for first in firsts)

@@ -14,8 +14,10 @@ from levelproof.levelgen.identity.keys import SAMPLER_VERSION
 from levelproof.pipeline.errors import Exit, UserError
 from levelproof.pipeline.jobs.generate import generate
 from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.runtime import in_another_process, prepare_jax
 from levelproof.pipeline.store.manifest import require_manifest
-from levelproof.pipeline.store.origins import origins_of
+from levelproof.pipeline.store.origins import Origin, origins_of
+from levelproof.pipeline.store.seed.file import is_seed
 
 OWN = ("manifest", "where", "continue")  # arguments that are not settings of a job
 FIXED = ("size", "levels", "first_level", "level_files", "distribution")  # settings that the manifest decides
@@ -36,22 +38,36 @@ def regenerate(arguments: Sequence[str], console: Console) -> Exit:
         Failure: the manifest is damaged; or see `generate`.
     """
     own, settings = split_arguments(arguments)
-    source = Path(own["manifest"]).expanduser()
-    manifest = require_manifest(source, columns_in(own.get("where")))
+    source, where = Path(own["manifest"]).expanduser(), own.get("where")
+    # To hash the levels of seeds, JAX starts
+    chosen = in_another_process(_chosen, source, where) if is_seed(source) else _chosen(source, where)
+    config, level_ids, origins = chosen
+    resumed = [f"continue_from={source}"] if own.get("continue") == "true" else []
+    files = [f"level_files={source}"] if origins is not None else []
+    job = replace(compose_job([*kept_settings(config, settings), *settings, *resumed, *files]), size=config["size"])
+    return generate(job, ["levelproof", "regenerate", *arguments], console, level_ids, origins)
+
+
+def _chosen(source: Path, where: str | None) -> tuple[Mapping[str, Any], list[int], dict[int, Origin] | None]:
+    """Return a split's settings, the ids of the levels that meet a condition, and their origins if these are files.
+
+    Raises:
+        UserError: another sampler made the levels, or none meets the condition.
+        Failure: the manifest is damaged.
+    """
+    if is_seed(source):
+        prepare_jax(device="cpu")
+    manifest = require_manifest(source, columns_in(where))
     config = manifest.config or {}
     if not from_files(config) and config["sampler_version"] != SAMPLER_VERSION:
         raise UserError(
             f"The levels of {source} are of sampler version {config['sampler_version']}, and this program makes those "
             f"of version {SAMPLER_VERSION}: use the levelproof that made them."
         )
-    level_ids = select(manifest.table, own.get("where")).column("level_id").to_numpy()
-    if not len(level_ids):
-        raise UserError(f"The condition {own.get('where')!r} holds for none of the {len(manifest.level_ids)} levels.")
-    resumed = [f"continue_from={source}"] if own.get("continue") == "true" else []
-    files = [f"level_files={source}"] if from_files(config) else []
-    job = replace(compose_job([*kept_settings(config, settings), *settings, *resumed, *files]), size=config["size"])
-    origins = origins_of(source, level_ids) if files else None
-    return generate(job, ["levelproof", "regenerate", *arguments], console, level_ids, origins)
+    level_ids = select(manifest.table, where).column("level_id").to_pylist()
+    if not level_ids:
+        raise UserError(f"The condition {where!r} holds for none of the {len(manifest.level_ids)} levels.")
+    return config, level_ids, origins_of(source, level_ids) if from_files(config) else None
 
 
 def split_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:

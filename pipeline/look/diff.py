@@ -19,6 +19,7 @@ from levelproof.experts.labels import TRAINED, WITNESSED, Label
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look import cost
 from levelproof.pipeline.look.inspect import QUANTILES, SPENT
+from levelproof.pipeline.look.query import prepare_for_seeds
 from levelproof.pipeline.read.select import columns_in, select
 from levelproof.pipeline.store.manifest import Manifest, changes_text, differences, require_manifest
 from levelproof.pipeline.store.remote import as_typed
@@ -35,6 +36,7 @@ def diff(one: Path, other: Path, where: str | None, rows: int, as_json: bool) ->
         UserError: a split is missing, DuckDB rejects the condition, or the splits have different levels.
         Failure: a fragment is damaged.
     """
+    prepare_for_seeds(one, other)
     facts = compare(one, other, where, rows)
     if as_json:
         json.dump(facts, sys.stdout, indent=2, allow_nan=False)

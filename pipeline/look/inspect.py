@@ -19,7 +19,7 @@ from levelproof.pipeline.look import cost, duplicates
 from levelproof.pipeline.look.entities import solved_by_entities
 from levelproof.pipeline.look.facts import print_facts
 from levelproof.pipeline.look.figures import Share
-from levelproof.pipeline.look.query import ALL_ROWS, SHOWN, RowQuery, ids_of, rows_of
+from levelproof.pipeline.look.query import ALL_ROWS, SHOWN, RowQuery, ids_of, prepare_for_seeds, rows_of
 from levelproof.pipeline.look.reasons import kinds_of_reasons
 from levelproof.pipeline.read.levels import distribution_of
 from levelproof.pipeline.read.select import columns_in, select
@@ -44,6 +44,7 @@ def inspect(split: Path, query: RowQuery, as_json: bool, against: Sequence[Path]
         UserError: no split, DuckDB rejects the condition or the order, or `against` has no levels.
         Failure: a fragment is damaged, or names data that the split lacks.
     """
+    prepare_for_seeds(split, *against)
     facts = survey(split, query, against, entities=True)
     if as_json:
         json.dump(facts, sys.stdout, indent=2, allow_nan=False)

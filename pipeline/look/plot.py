@@ -8,7 +8,7 @@ import pyarrow as pa
 from levelproof.experts.labels import TRAINED, Label
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look.figures import draw_panels
-from levelproof.pipeline.look.query import RowQuery
+from levelproof.pipeline.look.query import RowQuery, prepare_for_seeds
 from levelproof.pipeline.look.spread import spread
 from levelproof.pipeline.read.levels import writing_to
 from levelproof.pipeline.read.select import columns_in, select
@@ -31,6 +31,7 @@ def plot(split: Path, query: RowQuery, out: Path) -> None:
     """
     if out.suffix.lower() not in KINDS:
         raise UserError(f"Cannot draw to {out}: its name must end in {' or '.join(KINDS)}.")
+    prepare_for_seeds(split)
     table = select(require_manifest(split, ["label", *NUMBERS, *columns_in(query.where)]).table, query.where)
     values = {name.replace("_", " "): table[name].drop_null().to_numpy() for name in NUMBERS}
     values = {name: column[~np.isnan(column)] for name, column in values.items()}

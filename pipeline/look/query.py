@@ -12,8 +12,10 @@ import pyarrow as pa
 
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.read.select import TABLE, columns_in, select
+from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.columns import COLUMNS, with_current_names
 from levelproof.pipeline.store.manifest import require_manifest
+from levelproof.pipeline.store.seed.file import is_seed
 
 BLOCK = 2**14  # rows read at a time
 SHOWN = ("level_id", "label", "success_rate", "steps_to_goal", "steps_to_first_success", "env_steps")
@@ -68,6 +70,12 @@ def rows_of(split: Path, ids: np.ndarray, columns: Sequence[str] | None = None) 
         yield table.take(here).select(columns or table.column_names)
 
 
+def prepare_for_seeds(*splits: Path) -> None:
+    """Set JAX up if a split is of seeds, whose levels are made anew where a query asks for their hashes."""
+    if any(map(is_seed, splits)):
+        prepare_jax()
+
+
 def write_csv(split: Path, query: RowQuery, out: IO[str]) -> None:
     """Write the rows as CSV under a header; lists and structs are JSON, null is empty.
 
@@ -76,6 +84,7 @@ def write_csv(split: Path, query: RowQuery, out: IO[str]) -> None:
         Failure: a fragment is damaged.
     """
     query.check()
+    prepare_for_seeds(split)
     table = select(
         require_manifest(split, [*columns_in(query.where), *columns_in(query.sort)], compact=True).table, query.where
     )

@@ -50,6 +50,7 @@ def show(source: Path, level_id: int | None, out: Path) -> None:
     write = WRITERS.get(suffix)
     if write is None:
         raise UserError(f"Cannot draw to {out}: its name must end in {', '.join(WRITERS)}.")
+    prepare_jax()
     film = film_of(source, level_id, plays=suffix != ".png")
     with writing_to(out):
         write(film, out)
@@ -137,7 +138,6 @@ GOAL, FAIL, LATE, BROKEN = "goal reached", "touched red", "time is up", "world b
 
 def do_nothing(level: Level, rules: TaskParams) -> tuple[Record, End]:
     """Record doing nothing; return the record and how its first episode ends."""
-    prepare_jax()
     record = replay(level, np.zeros((RECORD_STEPS, ACTIONS, 1)), replace(rules, dense_reward_scale=0.0))
     if not record.done.any():
         return record, (RECORD_STEPS, "")

@@ -63,6 +63,7 @@ def gallery(split: Path, out: Path, where: str | None, most: int, policy: Path |
             written.
         Failure: the split is damaged.
     """
+    prepare_jax()
     manifest, matching = _chosen(split, where, most)
     count = manifest.table.num_rows
     contender = _contender(policy, manifest) if policy else None
@@ -97,7 +98,6 @@ def _chosen(split: Path, where: str | None, most: int) -> tuple[Manifest, int]:
 
 
 def _contender(policy: Path, manifest: Manifest) -> Contender:
-    prepare_jax()
     loaded, size = policy_at(policy), size_of(manifest.table["size"][0].as_py())
     require_size(loaded, size, as_typed(manifest.split), "choose another policy with --policy")
     return Contender(loaded, BLOCK)
