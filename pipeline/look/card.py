@@ -25,6 +25,7 @@ from levelproof.pipeline.look.figures import draw_panels, draw_shares
 from levelproof.pipeline.look.preview import preview
 from levelproof.pipeline.look.readme import FIGURES, MARK, PREVIEW, RATES, SHEET, STEPS, CardOptions, SplitFacts, readme
 from levelproof.pipeline.read.levels import distribution_of, writing_to
+from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.disk import NotRegular
 from levelproof.pipeline.store.files import write
 from levelproof.pipeline.store.layout import SHARDS
@@ -67,6 +68,7 @@ def card(splits: Sequence[Path], out: Path | None, options: CardOptions) -> None
     folder = out.absolute().parent.resolve()
     _require_ours(out)
     _require_plain([out])
+    prepare_jax()  # to hash levels of seeds, and to draw
     paths = [_below(root if remote else folder, split) for split in splits]
     manifests = [require_manifest(split, COLUMNS_READ, compact=True) for split in splits]
     facts = [_facts(path, manifest) for path, manifest in zip(paths, manifests, strict=True)]
@@ -74,9 +76,11 @@ def card(splits: Sequence[Path], out: Path | None, options: CardOptions) -> None
         for name in (PREVIEW, FIGURES):
             (folder / name).mkdir(parents=True, exist_ok=True)
             _require_plain([folder / name, *(folder / name).iterdir()])
+        if not any(map(_is_card, folder.glob("*.md"))):
+            _require_missing(folder / name for name in (SHEET, RATES, STEPS, *map(_preview_name, facts)))
         tables = [preview(manifest, SAMPLE) for manifest in manifests]
         for split_facts, table in zip(facts, tables, strict=True):
-            pq.write_table(table, folder / PREVIEW / f"{split_facts.subset}.parquet", row_group_size=100)
+            pq.write_table(table, folder / _preview_name(split_facts), row_group_size=100)
         figures = _draw(folder, facts, tables)
         name = options.name or (options.repo or (root if remote else folder).name.partition("@")[0]).rpartition("/")[2]
         write(out, readme(name, facts, options, figures, __version__).encode())
@@ -99,9 +103,25 @@ def _above(split: Path) -> Path:
     return whole.parent.parent if whole.is_dir() else whole.parent
 
 
+def _is_card(path: Path) -> bool:
+    return path.is_file() and MARK in path.read_text(encoding="utf-8", errors="replace")
+
+
 def _require_ours(out: Path) -> None:
-    if out.exists() and not (out.is_file() and MARK in out.read_text(encoding="utf-8", errors="replace")):
+    if out.exists() and not _is_card(out):
         raise UserError(f"{out} exists, but `levelproof card` did not write it: name another file with -o.")
+
+
+def _require_missing(paths: Iterable[Path]) -> None:
+    for path in paths:
+        if path.exists():
+            raise UserError(
+                f"{path} exists, but `levelproof card` did not write it: move it, or name another file with -o."
+            )
+
+
+def _preview_name(facts: SplitFacts) -> str:
+    return f"{PREVIEW}/{facts.subset}.parquet"
 
 
 def _require_plain(paths: Iterable[Path]) -> None:

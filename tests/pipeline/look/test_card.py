@@ -195,15 +195,26 @@ def test_python_in_the_card_runs(dataset: Path, tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.parametrize("name", ["README.md", "preview", "preview/128k-s.parquet", "figures/solved.svg"])
-def test_card_refuses_to_write_through_links(tmp_path: Path, name: str) -> None:
+def test_card_refuses_to_write_through_links(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
     split = made_split(tmp_path / "levels", [[Label.UNSOLVED]])
     mine = tmp_path / "mine"
-    mine.mkdir() if name == "preview" else mine.write_text("mine")
+    mine.mkdir() if name == "preview" else mine.write_text(text := f"mine {MARK}")
     link = tmp_path / "levels" / name
     link.parent.mkdir(exist_ok=True)
     link.symlink_to(mine)
     assert main(["card", str(split)]) == 2
-    assert not [*mine.iterdir()] if mine.is_dir() else mine.read_text() == "mine"
+    assert f"{link} is a link" in capsys.readouterr().err
+    assert not [*mine.iterdir()] if mine.is_dir() else mine.read_text() == text
+
+
+@pytest.mark.parametrize("name", ["preview/128k-s.parquet", "figures/solved.png"])
+def test_first_card_replaces_no_files_of_others(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    split, path = made_split(tmp_path / "levels", [[Label.UNSOLVED]]), tmp_path / "levels" / name
+    path.parent.mkdir()
+    path.write_text("mine")
+    assert main(["card", str(split)]) == 2
+    assert f"{path} exists, but `levelproof card` did not write it" in capsys.readouterr().err
+    assert path.read_text() == "mine"
 
 
 @pytest.mark.parametrize("kind", ["hard link", "pipe"])
