@@ -15,7 +15,7 @@ from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.jobs.schedule import WorkUnit, levels_text
 from levelproof.pipeline.store import quarantine
 from levelproof.pipeline.store.manifest import read_manifest, require_manifest
-from levelproof.pipeline.store.remote import absolute, as_typed, is_remote
+from levelproof.pipeline.store.remote import absolute, as_typed
 from levelproof.pipeline.store.seed.columns import ROW_GROUP
 from levelproof.pipeline.store.seed.file import is_seed, read_seed, seed_files
 from levelproof.pipeline.store.seed.source import LevelSource, without_levels
@@ -39,6 +39,7 @@ def grow(source: Path, out: Path, settings: Sequence[str], console: Console) -> 
             setting is not one of SETTINGS, or as `generate`.
         Failure: a seed file is damaged or has levels that this program does not make, or as `generate`.
     """
+    out = out.expanduser()
     if wrong := [setting for setting in settings if setting.partition("=")[0] not in SETTINGS]:
         raise UserError(
             f"`levelproof grow` does not accept {wrong[0]}: leave it out. It accepts {', '.join(SETTINGS)}; the seeds "
@@ -76,7 +77,7 @@ def _job(source: Path, out: Path, settings: Sequence[str], config: dict) -> Grow
     about, _ = read_seed(first, [])
     known = LevelSource.of(config, first)
     size, budget = config["size"], about.budget
-    path = out if is_remote(out) else out.expanduser().absolute()
+    path = out.absolute()
     if (path.parent.name, path.name) != (budget, size):
         raise UserError(
             f"The seeds have size {size} and budget {budget}, which the name of the split {out} must end in: use "
@@ -86,7 +87,7 @@ def _job(source: Path, out: Path, settings: Sequence[str], config: dict) -> Grow
     return GrowConfig(
         size=size,
         budget=budget,
-        out=as_typed(path.parent.parent),
+        out=str(path.parent.parent),
         level_files=as_typed(absolute(source)),
         density=chosen.density,
         key_every=chosen.key_every,

@@ -62,7 +62,7 @@ def import_folder(folder: Path, out: Path, console: Console) -> Exit:
             command writes to `out`, or made it, or imported it from another folder.
         Failure: a chunk is damaged, or a write failed; committed units stay.
     """
-    require_folder(out, "import to it")
+    require_folder(folder, "import it")
     if not can_be_noted(str(folder.absolute())):
         raise UserError(f"Cannot import {folder}: its name has characters that terminals cannot show, so rename it.")
     try:

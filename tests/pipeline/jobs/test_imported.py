@@ -247,6 +247,12 @@ def test_import_requires_a_split_named_by_budget_and_size(once: Path, tmp_path: 
     assert_refused(here([*words, "data/1M/m"], tmp_path), 2, "levels of size s", "-o data/1M/s")
     assert_refused(here([*words, "data/much/s"], tmp_path), 2, "budget is 'much'", "-o data/1M/s")
     assert_refused(here(["import", "nothing", "-o", "data/1M/s"], tmp_path), 2, "there is no .zgroup in")
+    done = here(["import", "s3://bucket/theirs", "-o", "data/1M/s"], tmp_path)
+    assert_refused(done, 2, "To import it, s3://bucket/theirs must be a folder on this machine")
+    (tmp_path / "the\nirs").symlink_to(once / "theirs")
+    done = here(["import", "the\nirs", "-o", "data/1M/s"], tmp_path)
+    assert_refused(done, 2, "characters that terminals cannot show, so rename it")
+    (tmp_path / "the\nirs").unlink()
     assert not list(tmp_path.iterdir())
 
 
