@@ -19,7 +19,7 @@ from levelproof.experts.evaluation import (
     play_sampled,
     play_sticky,
 )
-from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy
+from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy, policy_logits
 from levelproof.experts.witness.witness import replay
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import SIZES, Level
@@ -138,14 +138,23 @@ def test_players_draw_as_they_say(levels: Level) -> None:
     assert not np.asarray(do_nothing((), moment)).any()
 
 
-@pytest.mark.campaign
-@pytest.mark.parametrize("kind", ["attention", "invariant", "flat"])
-def test_policy_plays_by_its_logits(levels: Level, kind: str) -> None:
-    network = NetworkConfig(PolicyKind(kind), width=8, depth=1, heads=2)
-    params = initial_policy(jax.random.key(0), network, SIZES["s"])
-    sampled, greedy = (
-        [play(player, params, levels, IDS, 1, seed, DEFAULT_RULES) for seed in (0, 1)]
-        for player in (play_sampled(network), play_most_probable(network))
-    )
-    assert (sampled[0].env_steps != sampled[1].env_steps).any()
-    np.testing.assert_array_equal(greedy[0].env_steps, greedy[1].env_steps)
+def test_policy_plays_by_its_logits(levels: Level) -> None:
+    """Against numpy's softmax of each entry's logits, drawn by inversion."""
+    network, lanes = NetworkConfig(PolicyKind.ATTENTION, width=8, depth=1, heads=2), len(IDS)
+    params, uniform = initial_policy(jax.random.key(0), network, SIZES["s"]), np.random.default_rng(0)
+    params = jax.tree.map(lambda x: 3 * x, params)  # initial policies are almost even
+    moment = Moment(levels, task.reset(levels), np.zeros((6, lanes), np.int32), uniform.random((6, lanes), np.float32))
+    logits = np.asarray(jax.jit(policy_logits, static_argnums=1)(params, network, levels, levels.state))
+    entries = np.split(logits, np.cumsum(CHOICES)[:-1])
+    live = np.asarray(action_mask(levels))
+    assert all(np.ptp(entry, axis=0)[mine].min() > 0 for entry, mine in zip(entries, live, strict=True)), "no ties"
+    greedy = np.asarray(jax.jit(play_most_probable(network))(params, moment))
+    np.testing.assert_array_equal(greedy[live], np.stack([entry.argmax(0) for entry in entries])[live])
+    sampled, away = np.asarray(jax.jit(play_sampled(network))(params, moment)), 1e-5
+    for number, entry in enumerate(entries):
+        chances = np.exp(entry - entry.max(0))
+        ends = np.cumsum(chances / chances.sum(0), 0)
+        drawn, clear = (ends <= moment.uniform[number]).sum(0), np.abs(ends - moment.uniform[number]).min(0) > away
+        mine = live[number] & clear
+        np.testing.assert_array_equal(sampled[number, mine], drawn[mine])
+    assert (sampled[live] != greedy[live]).any()

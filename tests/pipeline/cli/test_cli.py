@@ -19,6 +19,7 @@ from levelproof.pipeline.store.event_files import events_of, runs_in
 from levelproof.pipeline.store.layout import data_paths, made_within
 from levelproof.pipeline.store.locks import only_writer
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
+from levelproof.pipeline.version import __version__
 from tests.pipeline.command import ROOT, TINY, assert_refused, here, run
 from tests.pipeline.made import lasting
 
@@ -71,7 +72,8 @@ def test_every_command_has_help_with_an_example(capsys: pytest.CaptureFixture[st
 
 
 def test_version_prints_the_version(tmp_path: Path) -> None:
-    assert run(["--version"], tmp_path).stdout.startswith("levelproof ")
+    done = run(["--version"], tmp_path)
+    assert (done.returncode, done.stdout) == (0, f"levelproof {__version__}\n")
 
 
 @pytest.mark.parametrize(

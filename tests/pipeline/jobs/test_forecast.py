@@ -23,13 +23,15 @@ def sample(busy: np.ndarray, solved: np.ndarray, **changes: object) -> Sample:
 
 
 def test_forecast_intervals_cover_nine_of_ten_outcomes() -> None:
-    rng, held = np.random.default_rng(0), 0
-    for _ in range(50):
+    rng, held, widths = np.random.default_rng(0), 0, []
+    for _ in range(400):
         seconds = rng.gamma(0.4, 2.0, 4256)
         cost = forecast(sample(seconds[:256], seconds[:256] < 1), 4000, 2, 32)
         truth = seconds[256:].sum() / 2 + 5
         held += cost.wall.low <= truth <= cost.wall.high
-    assert 38 <= held <= 50
+        widths.append((cost.wall.high - cost.wall.low) / truth)
+    assert 340 <= held <= 385
+    assert np.median(widths) < 0.5
 
 
 def test_forecast_scales_with_levels_and_workers() -> None:

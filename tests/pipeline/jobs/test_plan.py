@@ -1,17 +1,22 @@
 """`levelproof plan`, on a job so small that the sample is the whole job."""
 
 import json
+import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 from levelproof.configs.schema import JobConfig
+from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.jobs import plan as planning
 from levelproof.pipeline.jobs.address import ray_address
-from levelproof.pipeline.jobs.plan import MAX_SAMPLE
+from levelproof.pipeline.jobs.forecast import PerWitness, Sample, forecast
+from levelproof.pipeline.jobs.plan import MAX_SAMPLE, costs_of, report_lines
 from tests.pipeline.command import TINY, assert_refused, here
 from tests.pipeline.made import made_job
 
@@ -30,6 +35,24 @@ def test_plan_prints_a_forecast_and_leaves_no_file(tmp_path: Path) -> None:
         < facts["bytes"]["full"]["expected"]
     )
     assert not list(tmp_path.iterdir())
+
+
+def test_report_names_units_and_unknown_costs() -> None:
+    busy = np.tile([0.5, 1.5], 100)
+    some = Sample("core", 2, 60.0, 5.0, 20.0, busy, busy < 1, busy < 1, 200.0, {"full": PerWitness(10_000.0, 5)})
+    lines = report_lines(made_job("data", "levels=6M"), some, forecast(some, 6_000_000, 64, 32))
+    assert lines[0] == "6,000,000 levels of size s, budget 128k:"
+    assert re.match(r"  wall time: +26 \(.* to .*\) hours with 64 workers$", lines[1])
+    assert lines[-1].startswith("Measured on 200 of them, made on 2 cores here in ")
+    none = replace(some, solved=busy > 9)
+    assert "core-seconds per solved level: unknown" in " ".join(
+        " ".join(line.split()) for line in report_lines(made_job("data"), none, forecast(none, 100, 2, 32))
+    )
+
+
+def test_plan_of_levels_that_cannot_be_made_fails(tmp_path: Path) -> None:
+    with pytest.raises(Failure, match="No level could be made on this machine"):
+        costs_of(tmp_path)
 
 
 class Begun(Exception):

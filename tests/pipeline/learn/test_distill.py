@@ -72,7 +72,7 @@ def test_kept_experts_of_a_split_label_states_and_demonstrate(tmp_path: Path, mo
     split, alone = tmp_path / "data/5k/s", ("states=0", *TINY, *shown)
     with monkeypatch.context() as patch:
         stop_after_saving(patch, module)
-        here(["distill", str(split), "-o", "policy", *ROUNDS, *alone], tmp_path)
+        assert here(["distill", str(split), "-o", "policy", *ROUNDS, *alone], tmp_path).returncode == 130
     assert load_file(tmp_path / "policy/checkpoint.safetensors")[".imitation.updates"] == 2
     out = distilled(tmp_path, split, *alone, teachers=())
     weights = (out / "policy.safetensors").read_bytes()

@@ -157,6 +157,9 @@ def test_folder_of_splits_is_named(split: Path, tmp_path: Path) -> None:
         (["--start", "0.5"], "name one with --on"),
         (["--start", "1"], "--start is 1.0"),
         (["--against", "builtin:s"], "name the first one before it"),
+        (["--experts", "some/split", "--start", "0.5"], "leave out --start"),
+        (["--seed", "-1"], "--seed is -1"),
+        (["nowhere.py"], "There is no agent at nowhere.py"),
     ],
 )
 def test_command_refuses(tmp_path: Path, words: list[str], sentence: str) -> None:

@@ -126,7 +126,8 @@ def continues_bit_for_bit(words: tuple[str, ...], tmp_path: Path, monkeypatch: p
     made = programs.cache_info().misses
     stop_after_saving(monkeypatch, module)
     (tmp_path / "stopped").mkdir()
-    here(["train", "-o", "agent", f"ppo.env_steps={4 * PER_UPDATE}", *LANES, *words], tmp_path / "stopped")
+    words_of_four = ["train", "-o", "agent", f"ppo.env_steps={4 * PER_UPDATE}", *LANES, *words]
+    assert here(words_of_four, tmp_path / "stopped").returncode == 130
     assert load_file(tmp_path / "stopped/agent/checkpoint.safetensors")[".updates"] == 2
     monkeypatch.undo()
     out = trained(tmp_path / "stopped", 4, *words)
@@ -151,7 +152,7 @@ def test_run_killed_before_its_checkpoint_repeats_the_line_of_its_metrics(
 
     monkeypatch.setattr(module, "keep_run", killed)
     words = ["train", "-o", "agent", f"ppo.env_steps={3 * PER_UPDATE}", "interval=1", *LANES, *easy]
-    assert here(words, tmp_path).returncode != 0
+    assert here(words, tmp_path).returncode == 130
     stopped = metrics(tmp_path / "agent")
     assert [line["train/updates"] for line in stopped] == [1, 2]
     assert here(words, tmp_path).returncode == 0

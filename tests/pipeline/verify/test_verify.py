@@ -16,7 +16,7 @@ import pytest
 from levelproof.experts.labels import WITNESSED, Label
 from levelproof.experts.witness.witness import replay
 from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
-from levelproof.pipeline.errors import StoreFailure
+from levelproof.pipeline.errors import Failure, StoreFailure
 from levelproof.pipeline.jobs import repair as repairing
 from levelproof.pipeline.store import fragment, remote
 from levelproof.pipeline.store import shard as shards
@@ -294,6 +294,18 @@ def test_repair_stores_as_the_noted_command_if_no_fragment_is_left(split: Path) 
         path.write_bytes(b"PAR1")
     job = repairing._job(split, examine(split), [])
     assert (job.stored, job.keep_experts) == ("density=witness key_every=16", True)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [(None, "are lost"), ({"size": "huge"}, "does not accept"), ({"sampler_version": 99}, "with other settings")],
+)
+def test_repair_refuses_settings_that_would_make_other_levels(
+    split: Path, changes: dict[str, Any] | None, sentence: str
+) -> None:
+    config = None if changes is None else made_job().results | changes
+    with pytest.raises(Failure, match=sentence):
+        repairing._job(split, Findings(config=config), [])
 
 
 def test_repair_keeps_experts_that_rows_name_if_no_file_is_left(tmp_path: Path) -> None:
