@@ -19,6 +19,7 @@ from llvmlite import binding
 from levelproof.physics.codegen.buffers import LANES
 from levelproof.physics.codegen.call import Kernel
 from levelproof.physics.codegen.compile import write
+from tests.pace import patience
 
 LINUX = "aarch64-unknown-linux-gnu"
 TARGETS = {LINUX: "neoverse-v1", "arm64-apple-darwin": "apple-m1"}
@@ -62,7 +63,11 @@ class Emulated:
         (folder / "kernel.o").write_bytes(code)
         self._kernel, self._program = kernel, folder / "kernel"
         include = f"-I{jax.ffi.include_dir()}"
-        subprocess.run([COMPILER, "-static", include, "-o", self._program, MAIN, folder / "kernel.o"], check=True)
+        subprocess.run(
+            [COMPILER, "-static", include, "-o", self._program, MAIN, folder / "kernel.o"],
+            check=True,
+            timeout=patience(1800),
+        )
 
     def __call__(self, arguments: Any) -> Any:
         """Return the kernel's results for arrays of whole blocks of lanes."""
@@ -74,7 +79,7 @@ class Emulated:
         workspace = np.zeros(sum(buffer.bytes for buffer in scratch), np.uint8)
         request = b"".join(map(described, [np.array(len(passed)), *passed, *filled, workspace]))
         command = [EMULATOR, "-cpu", "max", self._program]
-        answer = subprocess.run(command, input=request, capture_output=True, check=True).stdout
+        answer = subprocess.run(command, input=request, capture_output=True, check=True, timeout=patience(1800)).stdout
         cuts = np.cumsum([0, *(x.nbytes for x in filled)])
         assert len(answer) == cuts[-1]
         arrays = [

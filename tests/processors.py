@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 from llvmlite import binding
 
+from tests.pace import patience
+
 ROOT = Path(__file__).parents[1]
 OWN = "own"
 # {name: (LLVM's processor, XLA's newest instruction set)}; fused operations begin with AVX2's generation
@@ -49,6 +51,6 @@ def run_on(name: str, module: str, *arguments: str, python: str | Path = sys.exe
     flags = [os.environ.get("XLA_FLAGS", ""), *([f"--xla_cpu_max_isa={newest}"] if newest else [])]
     environment = os.environ | {"XLA_FLAGS": " ".join(flags).strip(), "JAX_ENABLE_COMPILATION_CACHE": "false"}
     command = [python, "-m", module, name, *arguments]
-    ran = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    ran = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=patience(1800))
     assert not ran.returncode, ran.stderr
     return ran.stdout.strip()

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.pace import patience
+
 ROOT = Path(__file__).parent.parent
 ROOMS = ("physics", "levelgen", "experts", "configs", "pipeline")  # imported as levelproof.physics, and so on
 PRODUCT = (*ROOMS, "levelproof")
@@ -160,7 +162,9 @@ def test_wheel_and_type_checker_cover_the_product_only() -> None:
 
 @pytest.mark.skipif(not (ROOT / ".git").exists(), reason="needs a git clone")
 def test_repository_has_no_unknown_folder() -> None:
-    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    listed = subprocess.run(
+        ["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True, timeout=patience(1800)
+    ).stdout
     assert {path.partition("/")[0] for path in listed.splitlines() if "/" in path} == FOLDERS
 
 

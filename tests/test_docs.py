@@ -17,6 +17,7 @@ from levelproof.pipeline.exchange.level_json import export
 from levelproof.pipeline.exchange.parquet import export_parquet
 from levelproof.pipeline.look.gallery.gallery import SITE
 from levelproof.pipeline.store.manifest import read_manifest
+from tests.pace import patience
 from tests.pipeline.made import played_split
 from tests.quick import jit_once
 from tests.test_commands import run_command, smaller
@@ -92,7 +93,9 @@ def test_notebook_runs_from_top_to_bottom(
 def test_docs_build_without_a_broken_link(tmp_path: Path) -> None:
     words = ["-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
-    done = subprocess.run([sys.executable, *words], cwd=ROOT, env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, *words], cwd=ROOT, env=environment, capture_output=True, text=True, timeout=patience(1800)
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     page = (tmp_path / "api.html").read_text()
     assert all(f'id="levelproof.{name}"' in page for name in levelproof.__all__ if name != "__version__")

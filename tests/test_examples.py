@@ -33,7 +33,7 @@ def test_examples_use_valid_settings(path: Path) -> None:
 
 @pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: path.name)
 def test_scripts_parse(path: Path) -> None:
-    subprocess.run(["bash", "-n", str(path)], check=True)
+    subprocess.run(["bash", "-n", str(path)], check=True, timeout=patience(1800))
 
 
 def test_kubernetes_example_is_a_ray_job() -> None:

@@ -15,6 +15,7 @@ from levelproof.levelgen.sampling.sampler import CHUNK
 from tests.conftest import REQUIRE_ORACLE
 from tests.experts.witness.bits import FILE
 from tests.golden import make_levels
+from tests.pace import patience
 from tests.processors import OWN, ROOT, run_on
 
 pytestmark = pytest.mark.campaign
@@ -27,11 +28,11 @@ def oldest(tmp_path_factory: pytest.TempPathFactory) -> Path:
     requirements = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
     (lowest,) = [match[1] for text in requirements if (match := re.fullmatch(r"jax>=([0-9.]+),<[0-9.]+", text))]
     folder = tmp_path_factory.mktemp("oldest")
-    subprocess.run([sys.executable, "-m", "venv", folder], check=True)
+    subprocess.run([sys.executable, "-m", "venv", folder], check=True, timeout=patience(1800))
     python = folder / "bin" / "python"
     wanted = ROOT, "pytest", f"jax=={lowest}.0", f"jaxlib=={lowest}.0"
     install = [python, "-m", "pip", "install", "-q", *wanted]
-    installed = subprocess.run(install, capture_output=True, text=True)
+    installed = subprocess.run(install, capture_output=True, text=True, timeout=patience(1800))
     if installed.returncode and REQUIRE_ORACLE not in os.environ:
         pytest.skip(f"the oldest JAX cannot be installed: {installed.stderr[-500:]}")
     assert not installed.returncode, installed.stderr

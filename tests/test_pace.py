@@ -16,6 +16,7 @@ from tests.pace import patience, wait_until
 TESTS = Path(__file__).parent
 ROOT = TESTS.parent
 WAITS = ("wait", "settimeout", "wait_for_timeout")  # methods whose first argument is a limit
+RUNS = ("run", "call", "check_call", "check_output")  # functions of subprocess that wait for ever without one
 
 
 def test_patience_grows_with_the_slowness_and_never_shrinks(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -36,7 +37,9 @@ def test_wait_until_fails_when_its_patience_ends(monkeypatch: pytest.MonkeyPatch
 def test_commands_that_tests_start_inherit_the_slowness(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(pace.SLOWNESS, "7")
     code = "from tests.pace import patience; print(patience(2))"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True, timeout=patience(1800)
+    )
     assert done.stdout == "14.0\n"
 
 
@@ -74,6 +77,13 @@ def limits_of(node: ast.AST) -> list[ast.expr]:
     return []
 
 
+def waits_for_ever(node: ast.AST) -> bool:
+    match node:
+        case ast.Call(ast.Attribute(ast.Name("subprocess"), name), keywords=keywords) if name in RUNS:
+            return not {keyword.arg for keyword in keywords} & {"timeout", None}
+    return False
+
+
 def is_scaled(limit: ast.expr) -> bool:
     names = {node.id for node in ast.walk(limit) if isinstance(node, ast.Name)}
     return "patience" in names
@@ -88,3 +98,13 @@ def test_every_wait_in_tests_has_a_limit_that_scales() -> None:
         if not is_scaled(limit)
     ]
     assert not bare, "\n".join(["pass these limits through tests.pace.patience:", *bare])
+
+
+def test_every_process_that_a_test_runs_has_a_limit() -> None:
+    endless = [
+        f"{path.relative_to(ROOT)}:{node.lineno}"
+        for path in TESTS.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if waits_for_ever(node) and path != Path(pace.__file__)  # which measures how long a process takes
+    ]
+    assert not endless, "\n".join(["give these a timeout:", *endless])

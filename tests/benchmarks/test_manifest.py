@@ -11,6 +11,7 @@ from levelproof.experts.config import RECORD_STEPS
 from levelproof.pipeline.look.inspect import survey
 from levelproof.pipeline.store.leftovers import clean
 from levelproof.pipeline.store.manifest import read_manifest
+from tests.pace import patience
 
 
 def test_made_split_is_sealed_and_resembles_a_real_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -36,7 +37,7 @@ def test_made_split_is_sealed_and_resembles_a_real_one(tmp_path: Path, monkeypat
 def test_manifest_benchmark_times_every_command(tmp_path: Path) -> None:
     """Runs in its own process, because a forked child briefly has its parent's memory, which counts."""
     command = [sys.executable, "-m", "benchmarks", "manifest", "--levels", "3000", "--split", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=patience(1800))
     assert done.returncode == 0, done.stderr
     assert all(
         f"| levelproof {name} |" in done.stdout for name in ("status", "inspect", "generate, until the first unit")

@@ -26,6 +26,7 @@ from levelproof.levelgen.batching import blocks
 from levelproof.physics.types import FIXED_POLYGONS, Params
 from levelproof.pipeline.errors import Exit
 from tests.golden.load import HERE, load
+from tests.pace import patience
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -342,7 +343,15 @@ def test_small_campaign_runs_for_real(reference, level_file, tmp_path) -> None:
     command = [sys.executable, "-c", code, "parity", *options]
     environment = dict(os.environ) | {oracle.PYTHON_VARIABLE: str(reference)}
     keep = ["--keep", str(tmp_path / "kept")]
-    done = subprocess.run([*command, *keep], capture_output=True, text=True, cwd=ROOT, env=environment, check=False)
+    done = subprocess.run(
+        [*command, *keep],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env=environment,
+        check=False,
+        timeout=patience(1800),
+    )
     assert done.returncode == Exit.DONE, done.stderr
     result = json.loads(done.stdout)
     (one,) = result["sizes"]
@@ -355,7 +364,15 @@ def test_small_campaign_runs_for_real(reference, level_file, tmp_path) -> None:
     assert one["episodes"]["same"] >= 0.75
     assert result["versions"]["reference"]["jax2d"] == "1.0.1"
     assert "blocks" in done.stderr
-    again = subprocess.run([*command, *keep], capture_output=True, text=True, cwd=ROOT, env=environment, check=False)
+    again = subprocess.run(
+        [*command, *keep],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env=environment,
+        check=False,
+        timeout=patience(1800),
+    )
     assert json.loads(again.stdout)["sizes"] == result["sizes"]  # from the kept answers
 
 

@@ -21,6 +21,7 @@ from benchmarks.reference.actions import sticky_actions
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.pipeline.errors import Exit, Failure, UserError
 from levelproof.pipeline.runtime import own_cores
+from tests.pace import patience
 
 ROOT = Path(__file__).parent.parent.parent
 
@@ -184,7 +185,9 @@ def test_tiny_race_runs_for_real(reference, level_file, arguments) -> None:
     code = f"import os, sys; {pin}; from benchmarks.__main__ import main; sys.exit(main())"
     command = [sys.executable, "-c", code, *arguments, "--repeats", "2", "--level-file", str(level_file), "--json"]
     environment = dict(os.environ) | {oracle.PYTHON_VARIABLE: str(reference)}
-    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment, check=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=ROOT, env=environment, check=False, timeout=patience(1800)
+    )
     assert done.returncode == Exit.DONE, done.stderr
     document = json.loads(done.stdout)
     assert document["bench"] == arguments[0]

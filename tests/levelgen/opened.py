@@ -9,12 +9,20 @@ import numpy as np
 from benchmarks import oracle
 from levelproof.levelgen.files.kinetix import Fields, level_from_kinetix
 from levelproof.levelgen.level import Level
+from tests.pace import patience
 
 
 def handmade_levels(python: Path) -> Path:
     """Return the folder of level files in the reference's installation."""
     code = "from importlib.util import find_spec; print(find_spec('kinetix').origin)"
-    ran = subprocess.run([python, "-c", code], env=oracle.environment(), capture_output=True, text=True, check=True)
+    ran = subprocess.run(
+        [python, "-c", code],
+        env=oracle.environment(),
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=patience(1800),
+    )
     return Path(ran.stdout.strip()).parent / "levels"
 
 
@@ -40,7 +48,7 @@ def open_in_reference(python: Path, files: list[Path], out: Path, steps: int = 0
         "JAX_COMPILATION_CACHE_DIR": str(oracle.cache_folder() / "reference-jax"),
     }
     command = [python, oracle.SCRIPTS / "levels.py", out, str(steps), *files]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=patience(1800))
     assert done.returncode == 0, done.stderr[-2000:]
     with np.load(out) as arrays:
         return Played(files, dict(arrays))

@@ -19,6 +19,7 @@ from levelproof.levelgen.proofs import examine
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.physics.codegen import kept
+from tests.pace import patience
 
 SCRIPT = """
 from levelproof.pipeline.runtime import prepare_jax
@@ -73,7 +74,9 @@ def in_process(cache: Path) -> tuple[int, int, str]:
     """Run the program in a new process; return how often it was traced and loaded, and the result."""
     environment = {"PATH": "/usr/bin:/bin", "LEVELPROOF_CACHE_DIR": str(cache)}
     command = [sys.executable, "-c", SCRIPT]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=Path(__file__).parents[2])
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=environment, cwd=Path(__file__).parents[2], timeout=patience(1800)
+    )
     assert not done.returncode, done.stderr
     traced, loaded, result = done.stdout.split()
     return int(traced), int(loaded), result

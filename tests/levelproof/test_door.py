@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import levelproof
+from tests.pace import patience
 
 SOURCE = Path(levelproof.__file__)
 
@@ -50,7 +51,9 @@ def test_unknown_name_raises_attribute_error() -> None:
 
 def test_import_loads_no_heavy_packages() -> None:
     program = "import sys, levelproof; print({'jax', 'numpy', 'ray', 'zarr'} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", program], cwd=SOURCE.parents[1], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=SOURCE.parents[1], capture_output=True, text=True, timeout=patience(1800)
+    )
     assert done.stdout.strip() == "set()", done.stderr
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.pace import patience
 from tests.pipeline.command import ROOT, TINY
 
 ROOMS = ("physics", "levelgen", "experts", "configs", "pipeline")
@@ -27,7 +28,12 @@ print("read", len(data), "played", env.name)
 
 def build(source: Path, target: str, folder: Path) -> Path:
     """Build the wheel or the source distribution of a checkout with the project's own build backend."""
-    subprocess.run([sys.executable, "-m", "hatchling", "build", "-t", target, "-d", folder], cwd=source, check=True)
+    subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "-t", target, "-d", folder],
+        cwd=source,
+        check=True,
+        timeout=patience(1800),
+    )
     (path,) = folder.glob("*.whl" if target == "wheel" else "*.tar.gz")
     return path
 
@@ -55,7 +61,9 @@ def test_wheel_installs_levelproof_and_nothing_else(wheel: Path, tmp_path: Path)
     names = zipfile.ZipFile(wheel).namelist()
     top = {name.partition("/")[0] for name in names}
     assert {name for name in top if not name.endswith(".dist-info")} == {"levelproof"}
-    tracked = subprocess.run(["git", "ls-files", *ROOMS], cwd=ROOT, capture_output=True, text=True).stdout.split()
+    tracked = subprocess.run(
+        ["git", "ls-files", *ROOMS], cwd=ROOT, capture_output=True, text=True, timeout=patience(1800)
+    ).stdout.split()
     if tracked:
         assert {f"levelproof/{name}" for name in tracked} <= set(names)
     assert sorted(zipfile.ZipFile(build(ROOT, "wheel", tmp_path)).namelist()) == sorted(names)
@@ -71,7 +79,9 @@ def test_sdist_holds_each_module_once(sdist: Path, wheel: Path) -> None:
 
 @pytest.mark.parametrize("room", ROOMS)
 def test_room_refuses_a_second_import_name(room: str) -> None:
-    done = subprocess.run([sys.executable, "-c", f"import {room}"], cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", f"import {room}"], cwd=ROOT, capture_output=True, text=True, timeout=patience(1800)
+    )
     assert f"ImportError: import levelproof.{room}, not {room}" in done.stderr
 
 
@@ -85,6 +95,7 @@ def test_import_without_links_says_how_to_get_them(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "levelproof", "--help"], cwd=tmp_path, capture_output=True, text=True,
         env=os.environ | {"PYTHONPATH": ""},
+        timeout=patience(1800),
     )  # fmt: skip
     assert "git config core.symlinks true" in done.stderr.splitlines()[-1]
 
@@ -121,7 +132,7 @@ def research(tmp_path: Path) -> Path:
 def run_in(folder: Path, *command: str | Path) -> str:
     """Run a command without this process's import path; return its output."""
     environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "RAY_ADDRESS")}
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=patience(1800))
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -7,6 +7,7 @@ import sys
 import pytest
 
 from tests.golden.load import HERE
+from tests.pace import patience
 
 # No kernel exists yet, neither in the process nor on disk. Compiling takes long enough for all threads to ask for the
 # kernel in the meantime; the barrier makes them ask together
@@ -40,5 +41,7 @@ assert len(set(results.values())) == 1
 def test_first_steps_of_six_threads_succeed() -> None:
     environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
     command = [sys.executable, "-c", PROGRAM]
-    ran = subprocess.run(command, cwd=HERE.parents[1], env=environment, capture_output=True, text=True)
+    ran = subprocess.run(
+        command, cwd=HERE.parents[1], env=environment, capture_output=True, text=True, timeout=patience(1800)
+    )
     assert ran.returncode == 0, ran.stderr

@@ -59,7 +59,9 @@ def test_error_keeps_its_exit_code_when_its_reader_leaves(tmp_path: Path, unread
 def test_closed_stdout_is_not_an_error(split: Path) -> None:
     command = f"{sys.executable} -m levelproof status {split} >&-"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(["bash", "-c", command], env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        ["bash", "-c", command], env=environment, capture_output=True, text=True, check=False, timeout=patience(1800)
+    )
     assert (done.returncode, done.stderr) == (0, "")
 
 

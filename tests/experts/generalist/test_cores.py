@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from tests.pace import patience
 from tests.processors import ROOT
 
 # Different levels and random numbers give each core another gradient
@@ -79,12 +80,16 @@ for cores in (1, 2):
 
 @pytest.mark.slow
 def test_attempts_count_for_the_level_that_was_measured() -> None:
-    ran = subprocess.run([sys.executable, "-c", MEASURE], cwd=ROOT, capture_output=True, text=True)
+    ran = subprocess.run(
+        [sys.executable, "-c", MEASURE], cwd=ROOT, capture_output=True, text=True, timeout=patience(1800)
+    )
     assert ran.returncode == 0, ran.stderr
 
 
 @pytest.mark.slow
 def test_cores_hold_the_same_weights_after_an_update() -> None:
     """They act in their own lanes, and average their gradients."""
-    ran = subprocess.run([sys.executable, "-c", PROGRAM], cwd=ROOT, capture_output=True, text=True)
+    ran = subprocess.run(
+        [sys.executable, "-c", PROGRAM], cwd=ROOT, capture_output=True, text=True, timeout=patience(1800)
+    )
     assert ran.returncode == 0, ran.stderr

@@ -92,6 +92,20 @@ def test_loss_rewards_entropy_and_the_rehearsed_actions() -> None:
     np.testing.assert_allclose(imitating, 0.5 * nats * 2 / count, rtol=1e-4)
 
 
+def test_loss_weighs_the_error_of_values() -> None:
+    """Values of 0, in place of 1, have an error of a half; equal advantages are no gain."""
+    config = ExpertConfig(network=Network.FLAT, width=16, entropy_weight=0.0, imitation_weight=0.0, value_weight=0.5)
+    network, count = network_of(SIZE, config), 8
+    constants = LevelConstants(jnp.zeros(len(resting_features(SIZE))), jnp.ones(len(CHOICES), bool))
+    begun = jax.eval_shape(lambda: ppo.init(jax.random.key(0), network, constants.features, config))
+    params = jax.tree.map(lambda x: jnp.zeros(x.shape), begun.params)
+    zeros = jnp.zeros(count)
+    even = zeros - np.log(CHOICES).sum()
+    minibatch = Samples(jnp.ones((DYNAMIC, count)), jnp.zeros((len(CHOICES), count)), even, zeros, zeros + 1, zeros)
+    weighed = jax.jit(lambda: ppo.loss(params, network, constants, minibatch, config))()
+    np.testing.assert_allclose(weighed, 0.5 * 0.5, rtol=1e-4)
+
+
 def test_rows_round_trip_samples() -> None:
     rng, time, lanes = np.random.default_rng(1), 4, 3
     moving = rng.normal(size=(time, DYNAMIC, lanes)).astype(np.float32)

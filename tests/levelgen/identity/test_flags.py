@@ -19,6 +19,7 @@ from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
 from tests.experts.random_play import random_successes
 from tests.experts.small import IDS
+from tests.pace import patience
 
 ROOT = Path(__file__).parents[3]
 FLAGS = {
@@ -67,7 +68,7 @@ def test_environment_variables_leave_levels_and_random_play_unchanged() -> None:
     command = [sys.executable, "-m", "tests.levelgen.identity.test_flags"]
     folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     environment = os.environ | FLAGS | ({"JAX_COMPILATION_CACHE_DIR": folder} if folder else {})
-    theirs = subprocess.check_output(command, cwd=ROOT, env=environment, text=True)
+    theirs = subprocess.check_output(command, cwd=ROOT, env=environment, text=True, timeout=patience(1800))
     assert theirs.splitlines() == list(results())
 
 

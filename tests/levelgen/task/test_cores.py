@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.pace import patience
+
 pytestmark = pytest.mark.slow
 
 PROGRAM = """
@@ -39,5 +41,12 @@ print("equal")
 def test_two_cores_give_the_same_bits_as_one() -> None:
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
     root = Path(__file__).parents[3]
-    done = subprocess.run([sys.executable, "-c", PROGRAM], cwd=root, env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM],
+        cwd=root,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=patience(1800),
+    )
     assert done.stdout.strip() == "equal", done.stderr

@@ -11,6 +11,7 @@ import pytest
 
 from levelproof.physics.codegen import kept as module
 from levelproof.physics.codegen.kept import cached, cached_by_sources
+from tests.pace import patience
 
 # A process that steps a world and prints how many kernels it wrote and optimised, and a digest of the step
 PROGRAM = """
@@ -47,7 +48,9 @@ def made(code: bytes) -> tuple[Callable[[], bytes], list[bytes]]:
 @pytest.mark.slow
 def test_second_process_reuses_the_kernel_of_the_first(tmp_path: Path) -> None:
     command = [sys.executable, "-c", PROGRAM, str(tmp_path)]
-    first, second = (subprocess.check_output(command, cwd=ROOT, text=True).split() for _ in range(2))
+    first, second = (
+        subprocess.check_output(command, cwd=ROOT, text=True, timeout=patience(1800)).split() for _ in range(2)
+    )
     assert (first[:2], second[:2]) == (["1", "1"], ["0", "0"])
     assert first[2] == second[2]
 

@@ -20,6 +20,7 @@ from levelproof.pipeline.store.layout import data_paths, made_within
 from levelproof.pipeline.store.locks import only_writer
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.version import __version__
+from tests.pace import patience
 from tests.pipeline.command import ROOT, TINY, assert_refused, here, run
 from tests.pipeline.made import lasting
 
@@ -325,7 +326,13 @@ def test_pipe_closed_before_a_short_output_is_not_an_error(tmp_path: Path) -> No
     command = f"{sys.executable} -m levelproof columns steps | true; exit ${{PIPESTATUS[0]}}"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(
-        ["bash", "-c", command], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        ["bash", "-c", command],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=patience(1800),
     )
     assert (done.returncode, done.stderr) == (0, "")
 

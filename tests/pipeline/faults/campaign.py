@@ -143,7 +143,7 @@ class Campaign:
             for command in world.commands:
                 command.end()
             if mounted:
-                subprocess.run(["umount", "--lazy", str(files)], check=True)
+                subprocess.run(["umount", "--lazy", str(files)], check=True, timeout=patience(1800))
             shutil.rmtree(top)
             if stored:
                 shutil.rmtree(files)
@@ -295,14 +295,16 @@ def _can_mount(probe: Path) -> bool:
         _mount(probe, PLENTY)
     except (OSError, subprocess.CalledProcessError):
         return False
-    subprocess.run(["umount", str(probe)], check=True)
+    subprocess.run(["umount", str(probe)], check=True, timeout=patience(1800))
     return True
 
 
 def _mount(folder: Path, room: int) -> None:
     options = ["mount", "-t", "tmpfs", "-o", f"size={room}", "tmpfs", str(folder)]
-    subprocess.run(options, check=True, capture_output=True)
+    subprocess.run(options, check=True, capture_output=True, timeout=patience(1800))
 
 
 def _resize(folder: Path, room: int) -> None:
-    subprocess.run(["mount", "-o", f"remount,size={room}", str(folder)], check=True, capture_output=True)
+    subprocess.run(
+        ["mount", "-o", f"remount,size={room}", str(folder)], check=True, capture_output=True, timeout=patience(1800)
+    )

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.pace import patience
 from tests.pipeline.command import ROOT
 from tests.pipeline.faults.effects import lose_power
 
@@ -18,7 +19,7 @@ FIRST, SOME = 10_000, 4  # these run by default
 
 def run(first: int, count: int) -> None:
     words = [sys.executable, "-W", "ignore", "-m", "tests.pipeline.faults", str(first), str(count)]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False, timeout=patience(1800))
     failed = [part.partition("\n\n")[0] for part in done.stdout.split("FAILED ")[1:]]
     assert (done.returncode, failed) == (0, []), done.stderr[-2000:]
     assert f"{count} schedules, 0 failed" in done.stdout

@@ -133,4 +133,4 @@ def test_driver_does_not_start_jax(tmp_path: Path) -> None:
         "from levelproof.pipeline.jobs import cluster, generate"
     )
     environment = os.environ | {"JAX_PLATFORMS": "no_such_platform", "PYTHONPATH": str(ROOT)}
-    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=environment, check=True)
+    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=environment, check=True, timeout=patience(1800))

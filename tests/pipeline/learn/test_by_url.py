@@ -10,6 +10,9 @@ import pytest
 
 from tests.pace import patience
 from tests.pipeline.command import here
+from tests.pipeline.learn.test_distill import ROUNDS, TEACHERS
+from tests.pipeline.learn.test_train import LANES, PER_UPDATE
+from tests.pipeline.learn.test_train import TINY as SMALLEST
 from tests.pipeline.servers import serving_bucket
 
 pytestmark = pytest.mark.slow
@@ -23,6 +26,9 @@ TINY = (
     "network.width=16",
     "network.depth=1",
 )
+
+FEW = *LANES, f"ppo.env_steps={2 * PER_UPDATE}"
+FEW_ROUNDS = *ROUNDS, *TEACHERS
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +58,15 @@ def test_policies_of_a_url_are_those_of_its_folder(both: tuple[str, str], tmp_pa
     words = "evaluate", str(tmp_path / "0/policy"), "--on", "SPLIT", "--levels", "8", "--attempts", "2", "--json"
     ours, theirs = (json.loads(text) for text in results(both, tmp_path, *words))
     assert [levels["of"] for levels in ours["levels"]] == [levels["of"] for levels in theirs["levels"]]
+
+
+@pytest.mark.parametrize("words", [("train", "levels=SPLIT", *FEW), ("distill", "SPLIT", *FEW_ROUNDS)])
+def test_learners_of_a_url_learn_what_those_of_its_folder_do(
+    both: tuple[str, str], tmp_path: Path, words: tuple[str, ...]
+) -> None:
+    results(both, tmp_path, *words, "where=label = 'solved'", "-o", "policy", *SMALLEST)
+    ours, theirs = ((tmp_path / str(number) / "policy/policy.safetensors").read_bytes() for number in (0, 1))
+    assert ours == theirs
 
 
 def test_levels_of_a_url_are_those_of_its_folder(both: tuple[str, str], tmp_path: Path) -> None:

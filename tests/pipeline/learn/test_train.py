@@ -93,6 +93,9 @@ def test_folder_holds_a_policy_that_loads_and_is_evaluated(agent: Path, split: P
     done = here(["evaluate", str(agent), "--on", str(split), "--levels", "8", "--attempts", "1"], agent.parent)
     assert done.returncode == 0, done.stderr
     assert (agent / "curves.png").read_bytes().startswith(b"\x89PNG")
+    done = here(["gallery", str(split), "-o", "site", "--policy", str(agent)], agent.parent)
+    assert done.returncode == 0, done.stderr
+    assert '"policy"' in (agent.parent / "site" / "data" / "about.js").read_text()
 
 
 def test_run_that_was_stopped_continues_bit_for_bit(

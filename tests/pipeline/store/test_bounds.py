@@ -20,6 +20,7 @@ from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.columns import COLUMNS, OWN
 from levelproof.pipeline.store.manifest import fragment_paths, read_fragment, read_manifest
 from levelproof.pipeline.store.thrift import footer_in, pages_in
+from tests.pace import patience
 from tests.pipeline.command import ROOT
 from tests.pipeline.made import made_split
 
@@ -161,6 +162,7 @@ def test_read_fragment_refuses_bombs_before_decompressing_them(good: Path, tmp_p
         capture_output=True,
         text=True,
         check=True,
+        timeout=patience(1800),
     )
     grown, reasons = json.loads(done.stdout)
     assert reasons == [*HOSTILE.values()]

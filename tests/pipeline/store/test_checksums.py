@@ -12,6 +12,7 @@ from levelproof.experts.labels import Label
 from levelproof.pipeline.store.checksums import digests_of, has_own
 from levelproof.pipeline.store.layout import data_path
 from levelproof.pipeline.store.manifest import fragment_paths, read_fragment
+from tests.pace import patience
 from tests.pipeline.made import made_split
 
 
@@ -49,7 +50,9 @@ def test_fragments_have_the_digests_of_their_shards(split: Path) -> None:
     assert fragment.digests == {name: digests_of(shard)}
     assert json.loads(rows.schema.metadata[b"levelproof.sha256"]) == fragment.digests
     listed = "".join(f"{digest}  {file}\n" for file, digest in fragment.digests[name].items())
-    subprocess.run(["sha256sum", "--check", "--strict"], cwd=shard, input=listed, text=True, check=True)
+    subprocess.run(
+        ["sha256sum", "--check", "--strict"], cwd=shard, input=listed, text=True, check=True, timeout=patience(1800)
+    )
 
 
 def test_digests_of_depends_on_names_lengths_and_links(split: Path) -> None:

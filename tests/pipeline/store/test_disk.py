@@ -31,6 +31,7 @@ from levelproof.pipeline.store.layout import WRITER_LOCK, data_paths, new_attemp
 from levelproof.pipeline.store.locks import only_writer
 from levelproof.pipeline.store.manifest import begin_fragment, fragment_paths, write_fragment
 from levelproof.pipeline.store.shard import write_shard
+from tests.pace import patience
 from tests.pipeline.command import ROOT
 from tests.pipeline.driver import commit_made
 from tests.pipeline.made import honest_split, made_job, made_level, made_record
@@ -44,12 +45,12 @@ def tiny(tmp_path: Path) -> Iterator[Path]:
     folder = tmp_path / "tiny"
     folder.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=32k", "tmpfs", str(folder)]
-    if os.getuid() or subprocess.run(mount, check=False, capture_output=True).returncode:
+    if os.getuid() or subprocess.run(mount, check=False, capture_output=True, timeout=patience(1800)).returncode:
         pytest.skip("only root can make a tiny file system, and not everywhere")
     try:
         yield folder
     finally:
-        subprocess.run(["umount", "--lazy", str(folder)], check=True)
+        subprocess.run(["umount", "--lazy", str(folder)], check=True, timeout=patience(1800))
 
 
 def kept_experts() -> dict[int, KeptExpert]:

@@ -371,7 +371,8 @@ def test_processes_share_a_cache_and_survive_kills(bucket: Bucket, split: Path) 
         words = [sys.executable, "-c", code, str(there)]
         return subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": str(ROOT)})
 
-    true = begin(split).communicate()[0]
+    end = lambda process: process.communicate(timeout=patience(120))[0]
+    true = end(begin(split))
     bucket.server.spoil(5)
     for delay in (0.0, 0.05):
         processes = [begin("s3://bucket/data/s") for _ in range(3)]
@@ -381,8 +382,8 @@ def test_processes_share_a_cache_and_survive_kills(bucket: Bucket, split: Path) 
         time.sleep(delay)
         processes[0].kill()
         processes[0].communicate()
-        assert [process.communicate()[0] for process in processes[1:]] == [true, true]
-    assert begin("s3://bucket/data/s").communicate()[0] == true
+        assert [end(process) for process in processes[1:]] == [true, true]
+    assert end(begin("s3://bucket/data/s")) == true
 
 
 def test_split_on_a_web_server_reads_as_its_folder(split: Path, tmp_path: Path) -> None:

@@ -163,7 +163,9 @@ def test_concurrent_processes_keep_their_own_folders(parent: Path) -> None:
 
     def crowd(_: int) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-c", CROWD, "200"]
-        return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        return subprocess.run(
+            command, env=environment, capture_output=True, text=True, check=False, timeout=patience(1800)
+        )
 
     with ThreadPoolExecutor(4) as threads:
         for done in threads.map(crowd, range(4)):
