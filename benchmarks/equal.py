@@ -38,7 +38,6 @@ FIRST = 50_000  # id of the first level to clone from; the measured ones are sea
 BETWEEN_SEEDS = 10_000_000  # ids
 SCRATCH = ("network.width=64",)
 TUNING = ("ppo.learning_rate=2e-4", "ppo.entropy_weight=0.002", "ppo.critic_updates=5")
-PLOT = "equal.svg"
 UPDATES, STEPS, SECONDS, RATE = "train/updates", "train/env_steps", "train/core_seconds", "train/solve_rate"
 SETTLED = 5  # updates, after which lines no longer favour short episodes
 SHARES = "of all", "of solved", "best of 8"
@@ -111,6 +110,7 @@ def run(args: argparse.Namespace) -> Report:
     rows = [list(row) for row in dict.fromkeys(tuple(row) for each in results for row in rows_of(each))]
     rows += [row_of(name, ("", "", "", "", ""), players, name) for name in PLAYERS if name in players[ALL]]
     shown = {each["way"] for each in results}
+    page = "equal" if args.size == "s" else f"equal_{args.size}"
     head = ("policy", "seed", "pace", "env steps", "core-seconds before training", "in all", *SHARES)
     return Report(
         "Learners at equal cost",
@@ -135,12 +135,13 @@ def run(args: argparse.Namespace) -> Report:
             * any(WAYS[way].teachers for way in shown),
             *dict.fromkeys(each["remark"] for each in results if "remark" in each),
             *(f"{way}: `levelproof train {words_of(args, way, 0)}{started(way)}`." for way in WAYS if way in shown),
-            f"![Shares that reach the goal, in training and of sealed levels, against core-seconds]({PLOT})",
+            f"![Shares that reach the goal, in training and of sealed levels, against core-seconds]({page}.svg)",
             "Left: share of training episodes that reach the goal, by the current weights, on fresh random levels or "
             "those that the way trains on. Right, as in the table: share of the sealed levels labelled solved that the "
             "saved average of the weights solves; after a clone, the first point is the clone.",
         ],
-        plots={PLOT: partial(draw, results)},
+        page=page,
+        plots={f"{page}.svg": partial(draw, results)},
         made=f"{' to '.join(dict.fromkeys((dates[0], dates[-1])))}, on "
         f"{', '.join(dict.fromkeys(each['device'].removeprefix('cpu: ') for each in results))}",
     )  # fmt: skip
