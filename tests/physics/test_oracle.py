@@ -163,3 +163,14 @@ def test_golden_states_are_complete() -> None:
                 value = getattr(tree, field.name)
                 assert value.shape[-1] == lanes
                 assert np.isfinite(value).all(), field.name
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(Params) if field.type is float])
+def test_every_constant_has_an_effect(name: str) -> None:
+    """A number in place of a setting that has the same default would agree with the reference, too."""
+    sample, default, factor = golden("m"), Params(), 0.01 if name.startswith("max_") else 0.5
+    changed = dataclasses.replace(default, **{name: factor * getattr(default, name)})
+    compiled = jax.jit(lambda model, state, motor, thrust: step(model, state, motor, thrust, changed)[0])
+    after, before = compiled(sample.level.model, sample.state, sample.motor, sample.thrust), stepped("m")
+    assert any((np.asarray(getattr(after, field)) != getattr(before, field)).any() for field in MOTION)

@@ -342,3 +342,19 @@ def test_level_with_a_goal_floor_gets_the_other_goal_as_a_body(floor: Role) -> N
     body = level.model.active & (level.role == other)
     assert (body.sum(0) == 1).all()
     assert (level.model.inverse_mass > 0)[body].all()
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(Distribution)])
+def test_every_number_of_the_distribution_has_an_effect(name: str) -> None:
+    """A number in place of a setting that has the same default would have the reference's statistics, too."""
+    default, sizes = Distribution(), [SIZES["s"], SIZES["l"]]  # some count in one of them only
+    value = getattr(default, name)
+    others = {"proposals": 2, "hidden_penalty": 0.0, "max_wheel_power": 2 * value}  # bounded below, or huge
+    halved = 0.25 if value == 0 else value // 2 if isinstance(value, int) else value / 2
+    changed = dataclasses.replace(default, **{name: others.get(name, halved)})
+    assert any(
+        (x != y).any()
+        for size in sizes
+        for x, y in zip(*(jax.tree.leaves(sampled(size, 256, each)) for each in (default, changed)), strict=True)
+    )
