@@ -27,7 +27,6 @@ CONFIG_KEY = b"levelproof.config"  # the settings that decide results, as JSON
 DENSITIES_KEY = b"levelproof.densities"  # requested for its shards, as JSON; see `configs.schema.stored_as`
 DIGESTS_KEY = b"levelproof.sha256"  # of the files of each shard and checkpoint that its rows name, as JSON
 SEALED_KEY = b"levelproof.sealed"  # present if several units' fragments were merged into this one
-FENCE_KEY = b"levelproof.fence"  # random: makes bytes differ from all before (`publish`)
 
 # Packed arrays of a shard, with the bits of a component. What changes along time: (level, component, 256).
 PACKED = {"dyn32": 32, "dyn8": 8, "act": 8, "lvl32": 32, "lvl8": 8, "witness": 8}

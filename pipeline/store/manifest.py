@@ -83,21 +83,17 @@ def write_fragment(
         DIGESTS_KEY: json.dumps(digests_below(attempt.fragment.parent.parent, names, carried or {})).encode(),
     }
     metadata |= {SEALED_KEY: b"1"} if sealed else {}
-    data = bytes_of_fragment(table.replace_schema_metadata(metadata))
+    table = table.replace_schema_metadata(metadata)
+    whole = pa.BufferOutputStream()
+    how: Any = {"compression": "zstd", "use_dictionary": with_dictionaries(), "write_page_checksum": True}
+    pq.write_table(table, whole, row_group_size=ROW_GROUP, **how)
+    data = with_own(whole.getvalue().to_pybytes())
     _require_readable(data, attempt.fragment)
     with open(attempt.begun, "wb", opener=regular) as file:
         file.write(data)
     flush_entry(attempt.begun)
     attempt.begun.replace(attempt.fragment)
     flush_entry(attempt.fragment.parent)  # makes the fragment's name durable
-
-
-def bytes_of_fragment(table: pa.Table) -> bytes:
-    """Return the file of a fragment with these rows and metadata."""
-    whole = pa.BufferOutputStream()
-    how: Any = {"compression": "zstd", "use_dictionary": with_dictionaries(), "write_page_checksum": True}
-    pq.write_table(table, whole, row_group_size=ROW_GROUP, **how)
-    return with_own(whole.getvalue().to_pybytes())
 
 
 def _require_readable(data: bytes, path: Path) -> None:

@@ -20,8 +20,8 @@ import pyarrow.parquet as pq
 from levelproof.configs.schema import hash_of
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.bounds import DAMAGE
+from levelproof.pipeline.store.checksums import renewed
 from levelproof.pipeline.store.files import remove_data
-from levelproof.pipeline.store.formats import FENCE_KEY
 from levelproof.pipeline.store.fragment import read_fragment
 from levelproof.pipeline.store.layout import (
     MANIFEST,
@@ -36,7 +36,6 @@ from levelproof.pipeline.store.leases import LeaseLost, require_served
 from levelproof.pipeline.store.manifest import (
     DATA_COLUMNS,
     begin_fragment,
-    bytes_of_fragment,
     data_named_by,
     fragment_paths,
     write_fragment,
@@ -81,6 +80,9 @@ def _upload(folder: Path, split: Path, replaced: Collection[Path]) -> None:
             remove(marks)
             return
         committed = _at(theirs)
+        if committed.named & {path.relative_to(split).as_posix() for path in data}:
+            remove(marks)  # committed, but the answer was lost, and then another writer changed the bytes
+            return
     for path in data:
         remove_data(path)
     remove(marks)
@@ -126,7 +128,10 @@ def _barred(split: Path, fragment: Path, marks: set[Path]) -> set[Path]:
     These are none if another write came first. Attempts whose data is named there have committed by now.
     """
     committed = _at(fragment)
-    data = _renewed(committed.data) if committed.ids else _fence()
+    try:
+        data = renewed(committed.data, secrets.token_bytes(8)) if committed.ids else _fence()
+    except ValueError:
+        raise _damaged(fragment) from None
     if put_if(fragment, data, committed.version) is None:
         return set()
     return marks - {begun_path(split / name) for name in committed.named}
@@ -150,18 +155,15 @@ def _at(fragment: Path) -> _Committed:
         rows = pq.read_table(pa.BufferReader(file.data), columns=["level_id", *DATA_COLUMNS])
         return _Committed(_ids(rows), data_named_by(rows), file.version, file.data)
     except DAMAGE:
-        raise Failure(f"The fragment {fragment} is damaged: remove it, and run the same command again.") from None
+        raise _damaged(fragment) from None
+
+
+def _damaged(fragment: Path) -> Failure:
+    return Failure(f"The fragment {fragment} is damaged: remove it, and run the same command again.")
 
 
 def _ids(rows: pa.Table) -> frozenset[int]:
     return frozenset(rows["level_id"].to_pylist())
-
-
-def _renewed(data: bytes) -> bytes:
-    """Return a fragment with the same rows and metadata, and different bytes each time."""
-    table = pq.read_table(pa.BufferReader(data))
-    metadata = (table.schema.metadata or {}) | {FENCE_KEY: secrets.token_bytes(8)}
-    return bytes_of_fragment(table.replace_schema_metadata(metadata))
 
 
 def _fence() -> bytes:

@@ -24,7 +24,8 @@ from levelproof.pipeline.errors import Failure, StoreFailure, UserError
 from levelproof.pipeline.jobs import seal as jobs_seal
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import failure
-from levelproof.pipeline.store import leases, machine, remote
+from levelproof.pipeline.store import leases, machine, publish, remote
+from levelproof.pipeline.store.checksums import has_own
 from levelproof.pipeline.store.event_files import KEPT, events_of, new_run, runs_in, write_events
 from levelproof.pipeline.store.layout import (
     FRAGMENT,
@@ -280,6 +281,37 @@ def test_seal_of_a_replaced_writer_commits_nothing(
     theirs[0].release()
     forget()
     require_whole(here)
+
+
+@pytest.mark.slow
+@ALSO_MOTO
+@pytest.mark.parametrize("sealed", [False, True])
+def test_commit_keeps_its_data_if_the_answer_is_lost_and_another_writer_takes_over(
+    server: Server, here: Path, monkeypatch: pytest.MonkeyPatch, sealed: bool
+) -> None:
+    """The mark of another attempt makes that writer change the fragment's bytes before the request is repeated."""
+    if sealed:
+        drive(OUT)
+    put(new_attempt(THERE, unit_name(0, 1)).begun, b"")
+    put_if = publish.put_if
+
+    def put_twice(path: Path, data: bytes, there: Any) -> Any:
+        monkeypatch.setattr(publish, "put_if", put_if)
+        assert put_if(path, data, there)
+        clean(THERE, print)
+        assert get(path).data != data
+        return put_if(path, data, there)
+
+    monkeypatch.setattr(publish, "put_if", put_twice)
+    if sealed:
+        seal(THERE, [Piece.of(read_manifest(THERE).fragments[0])])
+    else:
+        commit_made(THERE, WorkUnit((0, 1)))
+        drive(OUT)
+    forget()
+    manifest = require_same_content(THERE, here)
+    assert {path.relative_to(THERE).as_posix() for path in data_paths(THERE)} == manifest.shards
+    assert not [path for path in remote.stored_in(THERE) if path.suffix == ".begun"]
 
 
 @pytest.mark.campaign
@@ -588,6 +620,20 @@ def test_require_conditions_reports_a_busy_store_as_busy(server: Server, monkeyp
     server.spoil(1)
     with pytest.raises(StoreFailure, match=r"Cannot write .*501 \(503 Service Unavailable\)"):
         require_conditions(THERE / ".job.json.501")
+
+
+def test_new_writer_gives_no_damaged_fragment_a_valid_digest(server: Server) -> None:
+    commit_made(THERE, WorkUnit((0, 1)))
+    (path,) = fragment_paths(THERE)
+    put(mark := new_attempt(THERE, unit_name(0, 1)).begun, b"")
+    before = get(path).data
+    assert ended(THERE, [mark], []) == {mark}
+    assert len(get(path).data) > len(before)
+    forget()
+    assert has_own(path)
+    put(path, get(path).data.replace(b"PAR1", b"PAR2", 1))
+    with pytest.raises(Failure, match="is damaged: remove it"):
+        ended(THERE, [mark], [])
 
 
 @ALSO_MOTO
