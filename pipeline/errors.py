@@ -2,6 +2,7 @@
 
 import re
 from enum import IntEnum
+from typing import Any
 
 from levelproof.configs.errors import readable
 
@@ -21,9 +22,18 @@ class LevelproofError(Exception):
 
     exit_code = Exit.FAILED
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _with_message, (type(self), *self.args)  # some types make their messages of other arguments
+
     def __str__(self) -> str:
         """Return the message with URLs as typed: `Path` turns `s3://` into `s3:/`."""
         return re.sub(r"\b(s3|gs|az|https?|hf):/(?=[^/])", r"\1://", readable(super().__str__()))
+
+
+def _with_message(kind: type[LevelproofError], *message: str) -> LevelproofError:
+    error = kind.__new__(kind)
+    error.args = message
+    return error
 
 
 class UserError(LevelproofError):

@@ -186,19 +186,19 @@ def in_another_process(function: Callable[..., T], *arguments: Any) -> T:
         Failure: that process died.
     """
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-        # A terminal sends Ctrl-C to the child, too, which would print a traceback: it inherits this mask
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            answer = process.submit(function, *arguments)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        try:
+            # A terminal sends Ctrl-C to the child, too, which would print a traceback: it inherits this mask
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            try:
+                answer = process.submit(function, *arguments)
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
             return answer.result()
-        except BrokenProcessPool:
+        except BrokenProcessPool as error:
             raise Failure(
                 "A process of this command died, perhaps because memory ran out: free some, then run the same command "
                 "again."
-            ) from None
+            ) from error
         except KeyboardInterrupt:  # SIGTERM reaches only this process
             for child in multiprocessing.active_children():
                 child.terminate()

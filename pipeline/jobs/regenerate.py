@@ -1,5 +1,6 @@
 """Training a split's levels at another budget: `levelproof regenerate manifest=data/256k/s budget=1M`."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from levelproof.pipeline.errors import Exit, UserError
 from levelproof.pipeline.jobs.generate import generate
 from levelproof.pipeline.read.select import columns_in, select
 from levelproof.pipeline.runtime import in_another_process, prepare_jax
+from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store.manifest import require_manifest
 from levelproof.pipeline.store.origins import Origin, origins_of
 from levelproof.pipeline.store.seed.file import is_seed
@@ -26,6 +28,7 @@ PRESETS = {"procedure": {field.name for field in fields(Procedure)}}
 HINT = "as in levelproof regenerate manifest=data/256k/s budget=1M where=\"label = 'unsolved'\""
 
 
+@stoppable()
 def regenerate(arguments: Sequence[str], console: Console) -> Exit:
     """Train all levels of a manifest, or those that meet a condition, at another budget.
 
@@ -39,6 +42,7 @@ def regenerate(arguments: Sequence[str], console: Console) -> Exit:
     """
     own, settings = split_arguments(arguments)
     source, where = Path(own["manifest"]).expanduser(), own.get("where")
+    columns_in(where)  # warns of old names, in this process
     # To hash the levels of seeds, JAX starts
     chosen = in_another_process(_chosen, source, where) if is_seed(source) else _chosen(source, where)
     config, level_ids, origins = chosen
@@ -57,6 +61,7 @@ def _chosen(source: Path, where: str | None) -> tuple[Mapping[str, Any], list[in
     """
     if is_seed(source):
         prepare_jax(device="cpu")
+        warnings.simplefilter("ignore", FutureWarning)  # of old names: the command's process has warned of them
     manifest = require_manifest(source, columns_in(where))
     config = manifest.config or {}
     if not from_files(config) and config["sampler_version"] != SAMPLER_VERSION:

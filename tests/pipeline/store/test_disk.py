@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+import pickle
 import re
 import subprocess
 import sys
@@ -20,14 +21,15 @@ from levelproof.experts.verdict.judge import KeptExpert
 from levelproof.experts.witness.success import no_success
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
-from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.errors import Failure, LevelproofError, UserError
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import failure
 from levelproof.pipeline.store.checkpoints import save_experts
-from levelproof.pipeline.store.disk import explaining_writes, flush_entry
+from levelproof.pipeline.store.disk import NotRegular, explaining_writes, flush_entry
 from levelproof.pipeline.store.fields import arrays_of
 from levelproof.pipeline.store.files import write
 from levelproof.pipeline.store.layout import WRITER_LOCK, data_paths, new_attempt, unit_name
+from levelproof.pipeline.store.leases import LeaseLost
 from levelproof.pipeline.store.locks import only_writer
 from levelproof.pipeline.store.manifest import begin_fragment, fragment_paths, write_fragment
 from levelproof.pipeline.store.shard import write_shard
@@ -77,6 +79,12 @@ def test_explaining_writes_turns_failed_writes_into_sentences(tmp_path: Path, co
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs a file that even root cannot write to")
+@pytest.mark.parametrize("error", [NotRegular("a/b"), LeaseLost(Path("s3://bucket/data/128k/s")), UserError("Why.")])
+def test_errors_keep_their_message_on_the_way_from_another_process(error: LevelproofError) -> None:
+    again = pickle.loads(pickle.dumps(error))
+    assert (type(again), str(again)) == (type(error), str(error))
+
+
 def test_explaining_writes_names_the_file_that_cannot_be_written(tmp_path: Path) -> None:
     elsewhere = Path("/proc/sys/kernel/version")
     words = f"^Cannot write to {elsewhere}, because writing is not permitted.* same command again"
