@@ -28,8 +28,8 @@ def export_kinetix(split: Path, where: str | None, out: Path) -> None:
         UserError: the split does not exist, the condition is invalid, no level qualifies, or `out` exists.
         Failure: the split is damaged.
     """
-    rows = select_witnessed(split, where or SOLVED)
     prepare_jax()
+    rows = select_witnessed(split, where or SOLVED)
     count = rows.num_rows
     with new_folder(out) as folder:
         for first in with_bar(range(0, count, BLOCK), "trajectories"):

@@ -5,6 +5,7 @@ from pathlib import Path
 from levelproof.levelgen.files.level_file import LevelFile, LevelFileError, write_level_file
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.read.levels import find_level, levels_of, rules_of, writing_to
+from levelproof.pipeline.runtime import prepare_jax
 
 
 def export(split: Path, level_id: int, out: Path) -> None:
@@ -16,6 +17,7 @@ def export(split: Path, level_id: int, out: Path) -> None:
     """
     if out.suffix.lower() != ".json":
         raise UserError(f"Cannot export to {out}: its name must end in .json.")
+    prepare_jax()
     manifest, row = find_level(split, level_id)
     file = LevelFile(levels_of(manifest, manifest.table), rules_of(manifest))
     try:

@@ -18,6 +18,7 @@ from levelproof.pipeline.exchange.tables import columns_for
 from levelproof.pipeline.read.levels import levels_of
 from levelproof.pipeline.read.progress_bar import ProgressBar
 from levelproof.pipeline.read.select import columns_in, select_some
+from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.columns import COLUMNS
 from levelproof.pipeline.store.created import new_folder
 from levelproof.pipeline.store.manifest import Manifest, require_manifest, settings_metadata
@@ -40,6 +41,7 @@ def export_parquet(split: Path, where: str | None, out: Path) -> None:
             written.
         Failure: the split is damaged.
     """
+    prepare_jax()  # hashes of seeds are computed as they are asked for
     manifest = require_manifest(split, columns_in(where), compact=True)
     ids = select_some(split, manifest.table, where).column("level_id").to_numpy()
     metadata = settings_metadata(manifest.fragments[0].config_hash, manifest.fragments[0].config)

@@ -48,12 +48,12 @@ def export_minari(split: Path, where: str | None, out: Path, kind: ActionKind = 
             of the extra `minari` are not installed.
         Failure: the split is damaged.
     """
+    prepare_jax()
     rows = select_witnessed(split, where or SOLVED)
     rules = rules_of(require_manifest(split, [], [rows.column("level_id")[0].as_py()]))
     budget, size = (rows.column(name)[0].as_py() for name in ("budget", "size"))
     name = size if kind == ActionKind.MULTI_DISCRETE else f"{size}-{kind}"
     dataset_id = f"{NAMESPACE}/{budget.replace('.', '_')}/{name}-v0"  # Minari's names have no dots
-    prepare_jax()
     with new_folder(out) as folder:
         data = (folder / dataset_id / "data").absolute()  # Minari mishandles relative paths
         storage = _new_storage(data, size, kind)
