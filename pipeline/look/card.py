@@ -76,11 +76,9 @@ def card(splits: Sequence[Path], out: Path | None, options: CardOptions) -> None
         for name in (PREVIEW, FIGURES):
             (folder / name).mkdir(parents=True, exist_ok=True)
             _require_plain([folder / name, *(folder / name).iterdir()])
-        if not any(map(_is_card, folder.glob("*.md"))):
-            _require_missing(folder / name for name in (SHEET, RATES, STEPS, *map(_preview_name, facts)))
         tables = [preview(manifest, SAMPLE) for manifest in manifests]
         for split_facts, table in zip(facts, tables, strict=True):
-            pq.write_table(table, folder / _preview_name(split_facts), row_group_size=100)
+            pq.write_table(table, folder / PREVIEW / f"{split_facts.subset}.parquet", row_group_size=100)
         figures = _draw(folder, facts, tables)
         name = options.name or (options.repo or (root if remote else folder).name.partition("@")[0]).rpartition("/")[2]
         write(out, readme(name, facts, options, figures, __version__).encode())
@@ -103,25 +101,9 @@ def _above(split: Path) -> Path:
     return whole.parent.parent if whole.is_dir() else whole.parent
 
 
-def _is_card(path: Path) -> bool:
-    return path.is_file() and MARK in path.read_text(encoding="utf-8", errors="replace")
-
-
 def _require_ours(out: Path) -> None:
-    if out.exists() and not _is_card(out):
+    if out.exists() and not (out.is_file() and MARK in out.read_text(encoding="utf-8", errors="replace")):
         raise UserError(f"{out} exists, but `levelproof card` did not write it: name another file with -o.")
-
-
-def _require_missing(paths: Iterable[Path]) -> None:
-    for path in paths:
-        if path.exists():
-            raise UserError(
-                f"{path} exists, but `levelproof card` did not write it: move it, or name another file with -o."
-            )
-
-
-def _preview_name(facts: SplitFacts) -> str:
-    return f"{PREVIEW}/{facts.subset}.parquet"
 
 
 def _require_plain(paths: Iterable[Path]) -> None:

@@ -207,16 +207,6 @@ def test_card_refuses_to_write_through_links(tmp_path: Path, name: str, capsys: 
     assert not [*mine.iterdir()] if mine.is_dir() else mine.read_text() == text
 
 
-@pytest.mark.parametrize("name", ["preview/128k-s.parquet", "figures/solved.png"])
-def test_first_card_replaces_no_files_of_others(tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    split, path = made_split(tmp_path / "levels", [[Label.UNSOLVED]]), tmp_path / "levels" / name
-    path.parent.mkdir()
-    path.write_text("mine")
-    assert main(["card", str(split)]) == 2
-    assert f"{path} exists, but `levelproof card` did not write it" in capsys.readouterr().err
-    assert path.read_text() == "mine"
-
-
 @pytest.mark.parametrize("kind", ["hard link", "pipe"])
 @pytest.mark.parametrize("name", ["README.md", "preview/128k-s.parquet", "figures/solved.svg"])
 def test_card_refuses_hard_links_and_pipes(tmp_path: Path, name: str, kind: str) -> None:
