@@ -133,7 +133,11 @@ def load_policy(folder: str | os.PathLike[str]) -> Policy:
                 f"{FORMAT}: update levelproof."
             )
         shape, origin = dict(config["network"]), dict(config["origin"])
-        network = NetworkConfig(PolicyKind(shape.pop("kind")), **{name: index(x) for name, x in shape.items()})
+        kind = PolicyKind(shape.pop("kind"))
+        try:
+            network = NetworkConfig(kind, **{name: index(x) for name, x in shape.items()})
+        except ValueError as error:
+            raise PolicyError(f"The policy {path} has a network that cannot be made here: its {error}.") from None
         size = None if config["size"] is None else size_of(config["size"])
         wanted = jax.eval_shape(lambda: initial_policy(key_of_seed(0), network, size or size_of("m")))
         room = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(wanted))

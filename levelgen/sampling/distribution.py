@@ -13,7 +13,8 @@ from levelproof.physics.bounds import require
 
 # m, from a free body's centre to its farthest point: green and blue may each have to fit into one half of the world
 MAX_REACH = HALF_WORLD / 2
-MAX_NUMBER = 1_000_000  # of any field: far from where single precision overflows
+MAX_NUMBER = 1_000_000  # of any float: far from where single precision overflows
+MAX_COUNT = 10**9  # of any integer
 MAX_PROPOSALS = 1000
 CONTROL_WEIGHTS = ("motor_only_weight", "thruster_only_weight", "motor_and_thruster_weight")
 
@@ -95,8 +96,9 @@ class Distribution:
     def __post_init__(self) -> None:
         names = [field.name for field in fields(self)]
         require(self, [name for name in names if name.endswith("_chance")], 0, 1)
-        require(self, names, 0)  # the error of a negative number need not name MAX_NUMBER
-        require(self, names, 0, MAX_NUMBER)
+        require(self, names, 0)  # the error of a negative number need not name a maximum
+        for kind, most in (float, MAX_NUMBER), (int, MAX_COUNT):
+            require(self, [field.name for field in fields(self) if field.type is kind], 0, most)
         require(self, ("proposals", "polygon_connections", "min_half_side", "min_radius"), 0, above=True)
         require(self, ("proposals",), 1, MAX_PROPOSALS)
         self._check_sums()

@@ -163,11 +163,12 @@ def test_unusable_policies_are_refused(tmp_path: Path) -> None:
     with pytest.raises(levelproof.PolicyError, match="size s only, not m"):
         policy.logits(levels, levels.state)
     config = (tmp_path / CONFIG).read_text()
-    changes = ('"width": 16', '"width": 17'), ('"depth": 2', f'"depth": {10**9}'), ('"origin"', '"other"')
-    for change in changes:
-        assert change[0] in config
-        (tmp_path / CONFIG).write_text(config.replace(*change))
-        with pytest.raises(levelproof.PolicyError, match="damaged"):
+    changes = [('"width": 16', '"width": 17', "damaged"), ('"origin"', '"other"', "damaged")]
+    changes += [('"depth": 1', f'"depth": {10**9}', "cannot be made here: its depth is 1000000000: it must be between")]
+    for old, new, words in changes:
+        assert old in config
+        (tmp_path / CONFIG).write_text(config.replace(old, new))
+        with pytest.raises(levelproof.PolicyError, match=words):
             levelproof.load_policy(tmp_path)
     (tmp_path / WEIGHTS).unlink()
     with pytest.raises(levelproof.PolicyError, match="no policy"):
