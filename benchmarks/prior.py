@@ -46,15 +46,19 @@ class Undecided(NamedTuple):
 
 def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("splits", nargs="+", type=Path, metavar="SPLIT", help="of the default procedure")
-    parser.add_argument("--policy", type=Path, default=Path("builtin:s"), help="default: builtin:s")
+    many = "one for all splits, or one for each (default: builtin:s)"
+    parser.add_argument("--policy", type=Path, nargs="+", default=[Path("builtin:s")], help=many)
     parser.add_argument("--attempts", type=int, default=ATTEMPTS, help=f"at each level (default: {ATTEMPTS})")
     parser.add_argument("--levels", type=int, help="use only the first levels of each split")
 
 
 def run(args: argparse.Namespace) -> Report:
     prepare_jax()
-    policy = policy_at(args.policy)
-    results = [measured(policy, split, args.attempts, args.levels) for split in args.splits]
+    if len(args.policy) not in (1, len(args.splits)):
+        raise UserError(f"--policy names {len(args.policy)} policies: name one, or one for each split.")
+    names = args.policy * len(args.splits) if len(args.policy) == 1 else args.policy
+    policies = {name: policy_at(name) for name in dict.fromkeys(names)}
+    results = [measured(str(name), policies[name], split, args) for name, split in zip(names, args.splits, strict=True)]
     if unsolved := [split for one, split in zip(results, args.splits, strict=True) if not one["solved"]]:
         advice = "raise --levels or leave it out" if args.levels else "name another split"
         raise UserError(f"No level of {unsolved[0]} is solved, so none has a cost: {advice}.")
@@ -63,6 +67,7 @@ def run(args: argparse.Namespace) -> Report:
         found.append(
             [
                 one["size"],
+                f"`{one['policy']}`",
                 share(one["found_of_unsolved"], one["unsolved"]),
                 share(one["found_of_solved"], one["solved"]),
                 f"{one['steps_ratio']:.2f}",
@@ -76,7 +81,6 @@ def run(args: argparse.Namespace) -> Report:
                 f"{one['attempting'] / one['solved']:.3f}",
             ]
         )
-    name, tries = f"`{args.policy}`", args.attempts
     total = lambda what: sum(one[what] for one in results)
     ratios = [one["attempting"] / max(one["searching_found"], 1e-9) for one in results]
     commands = "; ".join(f"`{one['command']}`" for one in results)
@@ -85,9 +89,9 @@ def run(args: argparse.Namespace) -> Report:
         results,
         [
             Table(
-                ("size", "of unsolved levels", "of solved levels", "steps to goal, policy / witness, median"),
+                ("size", "policy", "of unsolved levels", "of solved levels", "steps to goal, policy / witness, median"),
                 found,
-                f"Levels that {name} solves in {tries} attempts with sampled actions; 95% intervals",
+                f"Levels that a policy solves in {args.attempts} attempts with sampled actions; 95% intervals",
             ),
             Table(
                 ("size", "everything", "search", "search of levels that the attempts solve", "the attempts"),
@@ -111,15 +115,16 @@ def run(args: argparse.Namespace) -> Report:
     )
 
 
-def measured(policy: Policy, split: Path, attempts: int, count: int | None) -> dict[str, Any]:
+def measured(name: str, policy: Policy, split: Path, args: argparse.Namespace) -> dict[str, Any]:
     """Play the split's undecided levels, and return what that finds and costs."""
-    some = undecided(split, count)
+    some = undecided(split, args.levels)
     require_size(policy, some.levels.size, str(split), "choose another split")
-    played, attempting = timed(policy, some, attempts)
+    played, attempting = timed(policy, some, args.attempts)
     found = played.solved.any(1)
     shortest = np.where(played.solved, played.env_steps, np.inf).min(1)
     both = found & some.solved
     return {
+        "policy": name,
         "size": name_of(some.levels.size),
         "command": some.command,
         "solved": int(some.solved.sum()),

@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks.__main__ import parser
 from benchmarks.prior import run, undecided
+from levelproof import UserError
 from levelproof.pipeline.store.manifest import require_manifest
 from tests.pipeline.command import here
 
@@ -35,3 +36,9 @@ def test_counts_and_seconds_are_those_of_the_manifest(split: Path) -> None:
 def test_first_levels_are_those_of_the_lowest_ids(split: Path) -> None:
     everything, some = undecided(split, None), undecided(split, 16)
     np.testing.assert_array_equal(some.level_ids, everything.level_ids[everything.level_ids < 16])
+
+
+def test_policies_are_one_or_as_many_as_splits(split: Path) -> None:
+    args = parser("prior").parse_args(["prior", str(split), "--policy", "builtin:s", "builtin:m"])
+    with pytest.raises(UserError, match="names 2 policies: name one, or one for each split"):
+        run(args)
