@@ -18,7 +18,7 @@ from levelproof.levelgen.level import ACTIONS, SIZES, Level, Role, name_of, size
 from levelproof.levelgen.sampling.sampler import check_size
 from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.levelgen.task import rules as task
-from levelproof.levelgen.task.actions import CHOICES
+from levelproof.levelgen.task.actions import CHOICES, controls
 from levelproof.levelgen.task.rules import TaskParams, TaskState
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look.gallery.attempts import Contender
@@ -88,15 +88,21 @@ class Session:
         return self._moment()
 
     def step(self, request: Message) -> Message:
-        """Take one env step under `action`; `kept` says that the episode is the witness now."""
+        """Take one env step under `action`.
+
+        `kept` says that the episode is the witness now, `failed` that green touched red, `broken` that the world has
+        no numbers any more.
+        """
         action = _action(request["action"])
-        self._now, outcome = _advance(self._file.level, self._now, action[:, None], self._file.rules)
+        self._now, outcome, end = _advance(self._file.level, self._now, action[:, None], self._file.rules)
         self._actions.append(action)
         done, goal = bool(outcome.done[0]), bool(outcome.goal[0])
         kept = goal and len(self._actions) <= RECORD_STEPS
         if kept:
             self._witness = np.stack(self._actions)
-        moment = self._moment() | {"done": done, "goal": goal, "kept": kept}
+        broken = bool(task.has_nan(self._now.state)[0])
+        failed = bool(end.terminated[0]) and not (goal or broken)
+        moment = self._moment() | {"done": done, "goal": goal, "kept": kept, "failed": failed, "broken": broken}
         if done:
             self._now, self._actions = task.reset(self._file.level), []
         return moment
@@ -163,7 +169,7 @@ class Session:
         now = task.reset(level)
         states = [now.state]
         for action in actions:  # `replay` would reset the level when the episode ends, and lose its last state
-            now, _ = _advance(level, now, np.asarray(action, np.int32)[:, None], rules)
+            now, *_ = _advance(level, now, np.asarray(action, np.int32)[:, None], rules)
             states.append(now.state)
         position, rotation = (
             np.stack([np.asarray(x)[..., 0] for x in xs])
@@ -217,7 +223,7 @@ REQUESTS: dict[str, Callable[[Session, Message], Message]] = {
 
 @partial(jax.jit, static_argnames="rules")
 def _advance(level: Level, now: TaskState, action: Any, rules: TaskParams) -> Any:
-    return task.advance(level, now, action, rules)
+    return task.advance_driven(level, now, controls(level, action), rules)[:3]
 
 
 def places_of(

@@ -71,8 +71,6 @@ def verdict_of(run: TrainingRun) -> Message:
         "stage": "done",
         "label": str(verdict.label),
         "reason": verdict.label_reason,
-        "source": verdict.witness and str(verdict.witness),
-        "success_rate": float(np.nan_to_num(verdict.success_rate)),
         "env_steps": env_steps,
         "witness": result.record.action[: verdict.steps_to_goal, :, 0] if solved else None,
     }

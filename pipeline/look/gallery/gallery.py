@@ -25,7 +25,7 @@ from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.look import cost
 from levelproof.pipeline.look.entities import ENTITIES, count_entities
 from levelproof.pipeline.look.gallery.attempts import FAILS, SOLVES, Contender, PolicyAttempt
-from levelproof.pipeline.look.gallery.pages import NOTHING, PAGE, encode_columns, encode_page
+from levelproof.pipeline.look.gallery.pages import PAGE, encode_columns, encode_page
 from levelproof.pipeline.look.gallery.worlds import drawn_bodies, encode_array, states_of, world_of
 from levelproof.pipeline.look.spread import spread
 from levelproof.pipeline.read.levels import levels_of, rules_of
@@ -169,7 +169,6 @@ def _about(manifest: Manifest, matching: int, where: str | None, columns: list[d
         "page": PAGE,
         "block": BLOCK,
         "folder": FOLDER,
-        "nothing": NOTHING,
         "columns": columns,
     }
 

@@ -18,8 +18,9 @@
   };
 
   class Editor {
-    constructor(link, stage, changed) {
-      Object.assign(this, { link, stage, changed, tool: "select", drag: null });
+    // `begin` shows the start of the level, which edits apply to.
+    constructor(link, stage, changed, begin) {
+      Object.assign(this, { link, stage, changed, begin, tool: "select", drag: null });
       const buttons = Object.entries(TOOLS).map(([tool, [words]]) => this.button(words, () => this.take(tool), { role: "radio", "data-tool": tool }));
       at("tools").replaceChildren(...buttons);
       at("undo").addEventListener("click", () => this.change("undo"));
@@ -27,6 +28,7 @@
       stage.canvas.addEventListener("pointerdown", (event) => this.down(event));
       stage.canvas.addEventListener("pointermove", (event) => this.moved(event));
       stage.canvas.addEventListener("pointerup", (event) => this.up(event));
+      stage.canvas.addEventListener("pointercancel", () => { this.drag = null; });
       addEventListener("keydown", (event) => this.key(event));
       this.take("select");
     }
@@ -80,9 +82,11 @@
     }
 
     async down(event) {
+      if (event.button) return;
       const [x, y] = metresOf(this.stage.canvas, event);
       this.stage.canvas.setPointerCapture(event.pointerId);
-      this.stage.show(this.stage.world.start, null); // edits apply to the initial world
+      this.begin();
+      this.stage.show(this.stage.world.start, null); // without waiting for the engine
       if (this.tool === "thruster") this.drag = { from: [x, y] };
       else if (this.tool === "joint" || this.tool === "fixed") await this.edit("add_joint", x, y, this.tool === "fixed");
       else if (this.tool !== "select") {
@@ -104,7 +108,8 @@
       const { bodies } = await this.link.ask("at", { x, y });
       const entity = this.found({ kind: "body", number: bodies[0] });
       this.select(entity);
-      if (this.drag && entity && entity.number >= 4) Object.assign(this.drag, { ...entity, start: this.stage.pointOf(entity) });
+      if (!this.drag || !entity || entity.number < 4) return;
+      Object.assign(this.drag, { ...entity, start: Array.from(this.stage.world.start.slice(3 * entity.index, 3 * entity.index + 2)) });
     }
 
     moved(event) {
@@ -135,6 +140,13 @@
 
     // Show what is selected, and buttons for its edits.
     describeSelection() {
+      const focused = at("deeds").contains(document.activeElement) && document.activeElement.textContent;
+      this.describeEntity();
+      const again = [...at("deeds").children].find((button) => button.textContent === focused);
+      if (again) again.focus(); // every edit replaces the buttons
+    }
+
+    describeEntity() {
       const entity = this.stage.selected;
       at("selected").hidden = !entity;
       this.remove = null;

@@ -2,6 +2,8 @@
 "use strict";
 
 (function () {
+  const STOPPED = "The engine has stopped: run `levelproof play` again and reload this page.";
+
   class Link {
     constructor(progress) {
       this.waiting = new Map();
@@ -12,10 +14,9 @@
         this.socket.addEventListener("error", () => reject(new Error("Cannot reach the engine.")));
       });
       this.socket.addEventListener("close", () => {
-        const closed = new Error("The engine has stopped: run `levelproof play` again and reload this page.");
-        for (const { reject } of this.waiting.values()) reject(closed);
+        for (const { reject } of this.waiting.values()) reject(new Error(STOPPED));
         this.waiting.clear();
-        levelproof.problem(closed.message);
+        levelproof.problem(STOPPED);
       });
       this.socket.addEventListener("message", (event) => {
         const message = JSON.parse(event.data);
@@ -30,6 +31,7 @@
     // Send a request and return its answer; throw an Error if the server reports one.
     async ask(name, fields = {}) {
       await this.ready;
+      if (this.socket.readyState !== WebSocket.OPEN) throw new Error(STOPPED);
       const id = ++this.requests;
       this.socket.send(JSON.stringify({ ask: name, id, ...fields }));
       return new Promise((resolve, reject) => this.waiting.set(id, { resolve, reject }));

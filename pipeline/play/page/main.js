@@ -16,7 +16,7 @@
   }
 
   const player = new Player(link, stage);
-  const editor = new Editor(link, stage, opened);
+  const editor = new Editor(link, stage, opened, () => player.rewind());
   const expert = new Expert(link, stage, (film) => {
     at("watch").disabled = at("save-witness").disabled = false;
     player.film(film);
@@ -49,6 +49,7 @@
   at("open").addEventListener("change", async (event) => {
     const [file] = event.target.files;
     if (!file) return;
+    event.target.blur(); // else it takes the keys
     if (file.size > MAX_BYTES) { // a much larger one would close the connection without a message
       levelproof.problem(`${file.name} is larger than any level file: it has ${(file.size / 1e6).toFixed(1)} MB.`);
       event.target.value = "";
@@ -61,15 +62,17 @@
     }
     event.target.value = "";
   });
-  at("new").addEventListener("change", async () => {
-    if (at("new").value) await open("empty", { size: at("new").value });
-    at("new").value = "";
+  at("new").addEventListener("click", () => { // a list alone would open another level with each arrow key
+    at("new").blur();
+    open("empty", { size: at("new-size").value });
   });
+  levelproof.leaveAfterMouse(at("new-size"));
   at("save").addEventListener("click", () => save(false));
   at("save-witness").addEventListener("click", () => save(true));
 
   link.ask("level").then((level) => {
-    at("new").replaceChildren(new Option("…", ""), ...level.sizes.map((size) => new Option(`size ${size}`, size)));
+    at("new-size").replaceChildren(...level.sizes.map((size) => new Option(`size ${size}`, size)));
+    if (level.sizes.includes(level.size)) at("new-size").value = level.size;
     opened(level);
   }).catch((error) => levelproof.problem(error.message));
 })();

@@ -2,7 +2,7 @@
 "use strict";
 
 (function () {
-  const { liveEntries, entryName } = window.levelproof;
+  const { liveEntries, entryName, many } = window.levelproof;
   const at = (id) => document.getElementById(id);
   // Key: [entry of the action, value]; as in the reference's editor, plus letters for the motors it has no keys for.
   const KEYS = {
@@ -11,16 +11,18 @@
   };
   const NAMES = { ArrowLeft: "←", ArrowRight: "→", ArrowUp: "↑", ArrowDown: "↓", a: "A", d: "D", w: "W", s: "S" };
 
+  const steps = (count) => many(count, "step");
+
   class Player {
     constructor(link, stage) {
-      Object.assign(this, { link, stage, playing: false, held: new Set(), busy: false });
+      Object.assign(this, { link, stage, playing: false, held: new Set(), codes: new Map(), busy: false, shown: 0 });
       at("play").addEventListener("click", () => this.play(!this.playing));
       at("step").addEventListener("click", () => { this.play(false); this.step(); });
       at("restart").addEventListener("click", () => this.restart());
       at("watch").addEventListener("click", () => this.watch());
       at("attempt").addEventListener("click", () => this.attempt());
       addEventListener("keydown", (event) => this.key(event, true));
-      addEventListener("keyup", (event) => this.key(event, false));
+      addEventListener("keyup", (event) => this.key(event, false)); // never comes for keys held with Meta on a Mac
       addEventListener("blur", () => { for (const key of [...this.held]) this.release(key); });
       levelproof.leaveAfterMouse(at("speed"));
     }
@@ -48,7 +50,11 @@
         button.type = "button";
         button.style.setProperty("--colour", `var(--binding-${entry})`);
         button.textContent = `${NAMES[key] || key} ${entryName(entry)} ${effect}`;
-        button.addEventListener("pointerdown", (event) => { button.setPointerCapture(event.pointerId); this.press(key); });
+        button.addEventListener("pointerdown", (event) => {
+          if (event.button) return;
+          button.setPointerCapture(event.pointerId);
+          this.press(key);
+        });
         for (const end of ["pointerup", "pointercancel"]) button.addEventListener(end, () => this.release(key));
         this.buttons.set(key, button);
         return button;
@@ -57,14 +63,20 @@
     }
 
     key(event, down) {
+      if (!down) { // what a key pressed is released with it, whatever else is held by then
+        this.release(this.codes.get(event.code));
+        this.codes.delete(event.code);
+        return;
+      }
       if (event.ctrlKey || event.metaKey || event.altKey || /^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName)) return;
       const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
       if (this.buttons && this.buttons.has(key)) {
         event.preventDefault();
-        if (!down) this.release(key);
-        else if (!event.repeat) this.press(key);
-      } else if (down && key === "r") this.restart();
-      else if (down && key === " " && event.target.tagName !== "BUTTON") {
+        if (event.repeat) return;
+        this.codes.set(event.code, key);
+        this.press(key);
+      } else if (key === "r") this.restart();
+      else if (key === " " && (event.target.tagName !== "BUTTON" || event.target.closest("#pads"))) {
         event.preventDefault();
         this.play(!this.playing);
       }
@@ -78,7 +90,7 @@
 
     release(key) {
       this.held.delete(key);
-      if (this.buttons.has(key)) this.buttons.get(key).classList.remove("lit");
+      if (this.buttons?.has(key)) this.buttons.get(key).classList.remove("lit");
     }
 
     action() {
@@ -95,8 +107,9 @@
       if (!playing) return;
       this.watching = null;
       let due = performance.now();
+      const turn = (this.turn = {}); // a loop that waits for a slow step must not go on beside the next one
       const frame = async (now) => {
-        if (!this.playing) return;
+        if (!this.playing || this.turn !== turn) return;
         const pace = (1000 * this.level.seconds) / Number(at("speed").value);
         if (now >= due && !this.busy) {
           due = Math.max(due + pace, now - pace);
@@ -128,19 +141,30 @@
     end(moment) {
       this.play(false);
       this.ended = true;
-      const over = moment.timestep >= this.level.steps ? "Time is up." : "Green touched red.";
+      const over = moment.failed ? "Green touched red." : moment.broken ? "The world breaks down." : "Time is up.";
       const what = moment.kept ? ": save it below." : `, but a witness has at most ${this.level.longest}: reach the goal sooner to save it.`;
-      this.say(moment.goal ? `Solved in ${moment.timestep} steps${what}` : over, moment.goal);
+      this.say(moment.goal ? `Solved in ${steps(moment.timestep)}${what}` : over, moment.goal);
       if (moment.kept) at("watch").disabled = at("save-witness").disabled = false;
     }
 
     async restart() {
       this.ended = false;
       this.watching = null;
-      const moment = await this.link.ask("restart");
-      this.stage.show(moment.places, null);
-      this.clock(0);
-      this.say("");
+      try {
+        const moment = await this.link.ask("restart");
+        this.stage.show(moment.places, null);
+        this.clock(0);
+        this.say("");
+      } catch (error) {
+        levelproof.problem(error.message);
+      }
+    }
+
+    // Go to the start, which edits apply to; stay there if it is what the page shows.
+    rewind() {
+      const there = !this.playing && !this.watching && !this.shown;
+      this.play(false);
+      if (!there) this.restart();
     }
 
     // Play the witness.
@@ -158,8 +182,8 @@
       try {
         const film = await this.link.ask("attempt");
         if (film.goal) at("watch").disabled = at("save-witness").disabled = false;
-        const steps = `in ${film.actions.length} steps`;
-        this.film(film, film.goal ? `The policy reaches the goal ${steps}: save it below.` : `The policy fails ${steps}.`);
+        const within = `in ${steps(film.actions.length)}`;
+        this.film(film, film.goal ? `The policy reaches the goal ${within}: save it below.` : `The policy fails ${within}.`);
       } catch (error) {
         levelproof.problem(error.message);
       } finally {
@@ -167,7 +191,7 @@
       }
     }
 
-    film(film, words = `The witness reaches the goal in ${film.actions.length} steps.`) {
+    film(film, words = `The witness reaches the goal in ${steps(film.actions.length)}.`) {
       this.play(false);
       this.ended = true;
       this.watching = film;
@@ -189,6 +213,7 @@
     }
 
     clock(step) {
+      this.shown = step;
       at("clock").textContent = `step ${step} of ${this.level.steps} · ${(step * this.level.seconds).toFixed(1)} s`;
     }
 

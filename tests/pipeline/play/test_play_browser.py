@@ -129,7 +129,8 @@ def test_film_ends_when_another_level_is_opened(page: Any, tmp_path: Path) -> No
     page.select_option("#speed", "0.25")
     button(page, "Watch")
     page.wait_for_function("/^step [1-9]/.test(document.querySelector('#clock').textContent)")  # frames may be skipped
-    page.select_option("#new", "s")
+    page.select_option("#new-size", "s")
+    page.click("#new")
     page.wait_for_function("document.querySelector('#pads').textContent.includes('Nothing acts')")
     page.wait_for_timeout(1000 * patience(0.5))  # ms, in which the film could go on
     assert page.locator("#clock").inner_text().startswith("step 0 of")

@@ -1,4 +1,4 @@
-// Keeps a page's keys working after its lists were used.
+// What the gallery and the player share besides drawing: lists that leave the keys to the page, and counts in words.
 "use strict";
 
 (function () {
@@ -11,5 +11,8 @@
     list.addEventListener("change", () => { if (mouse) list.blur(); });
   }
 
-  Object.assign(window.levelproof, { leaveAfterMouse });
+  // A count and its noun: "1 step", "1,024 levels".
+  const many = (count, noun) => `${count.toLocaleString("en")} ${noun}${count === 1 ? "" : "s"}`;
+
+  Object.assign(window.levelproof, { leaveAfterMouse, many });
 })();

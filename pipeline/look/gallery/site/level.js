@@ -3,7 +3,7 @@
 "use strict";
 
 (function () {
-  const { load, create, readable, formatted, statesOf, between, bytesOf, liveEntries, entryName, drawWorld } = window.levelproof;
+  const { load, create, readable, formatted, statesOf, between, bytesOf, liveEntries, entryName, drawWorld, many } = window.levelproof;
   const ENTRIES = 6; // entries of an action
   const REST = 0.8; // s; pause on the last picture before the witness restarts
   const at = (id) => document.getElementById(id);
@@ -30,6 +30,7 @@
       this.play(false);
       Object.assign(this, { row, film: null, policy: null, steps: 0, world: null });
       if (row === null) return;
+      document.querySelector("#level .columns").hidden = true; // it is about the level before
       const id = this.columns.values.level_id[row];
       const [world, data] = await Promise.all([this.worlds.get(row), load(`levels/${Math.floor(row / this.columns.about.folder)}/${id}`)]);
       if (this.row !== row) return; // another level was opened while this one loaded
@@ -39,6 +40,7 @@
       this.steps = Math.max(0, ...[this.film, this.policy].filter(Boolean).map((film) => film.steps)); // of the longer
       this.now = new Float32Array(world.start.length);
       this.time = 0;
+      document.querySelector("#level .columns").hidden = false;
       this.describe(data.row);
       this.fit();
       if (this.steps && !matchMedia("(prefers-reduced-motion: reduce)").matches) this.play(true);
@@ -68,14 +70,14 @@
       };
       const entries = Object.entries(row).filter(([name]) => !["label_reason", "command", "learning_curve"].includes(name));
       at("row").replaceChildren(...entries.flatMap(([name, entry]) => [create("dt", {}, readable(name)), create("dd", {}, name === "level_id" ? String(entry) : value(entry))]));
-      const known = this.film ? `its witness reaches the goal in ${this.film.steps} steps` : "there is no witness, so this is its initial world";
+      const known = this.film ? `its witness reaches the goal in ${many(this.film.steps, "step")}` : "there is no witness, so this is its initial world";
       at("stage").setAttribute("aria-label", `Level ${row.level_id}, ${row.label}: ${known}. ${worldInWords(this.world)}`);
       at("stages").classList.toggle("two", Boolean(this.policy));
       at("policy").hidden = !this.policy;
       at("stage-words").hidden = !this.policy;
       if (!this.policy) return;
-      const outcome = `${this.policy.solved ? "solves it" : "fails"} in ${this.policy.steps} steps`;
-      at("stage-words").textContent = this.film ? `Witness: ${this.film.steps} steps` : "No witness";
+      const outcome = `${this.policy.solved ? "solves it" : "fails"} in ${many(this.policy.steps, "step")}`;
+      at("stage-words").textContent = this.film ? `Witness: ${many(this.film.steps, "step")}` : "No witness";
       at("policy-words").textContent = `Policy: ${outcome}`;
       at("policy-stage").setAttribute("aria-label", `The policy's attempt: it ${outcome}.`);
     }
@@ -108,9 +110,9 @@
       if (!this.playing) return;
       if (this.time >= this.steps) this.time = 0;
       let before = performance.now();
-      const world = this.world;
+      const turn = (this.turn = {}); // pausing and playing within a frame must not leave two loops
       const frame = (now) => {
-        if (!this.playing || this.world !== world) return;
+        if (!this.playing || this.turn !== turn) return;
         const steps = ((now - before) / 1000 / this.columns.about.step_seconds) * Number(at("speed").value);
         before = now;
         this.time += Math.max(0, steps);

@@ -3,9 +3,9 @@
 "use strict";
 
 (async function () {
-  const { load, Columns, Worlds, Choice, Panel, Grid, LevelPage, create, readable } = window.levelproof;
+  const { load, Columns, Worlds, Choice, Panel, Grid, LevelPage, create, readable, many } = window.levelproof;
   const at = (id) => document.getElementById(id);
-  let columns, worlds, choice, panel, grid, page, rows, scrolled = 0, overview = "";
+  let columns, worlds, choice, panel, grid, page, rows, scrolled = 0, overview = "", waiting = false;
 
   // Show a problem; "" clears it.
   levelproof.report = (problem) => { at("problem").textContent = problem; };
@@ -59,7 +59,7 @@
     const [name, direction] = choice.sortedBy;
     const { levels, found } = columns.about;
     const some = rows.length === columns.rows ? "" : `${rows.length.toLocaleString("en")} of `;
-    const all = columns.rows < levels ? `${columns.rows.toLocaleString("en")} levels, more to come` : `${levels.toLocaleString("en")} levels`;
+    const all = columns.rows < levels ? `${many(columns.rows, "level")}, more to come` : many(levels, "level");
     at("count").textContent = some + all + (found > levels ? ` (spread evenly over ${found.toLocaleString("en")})` : "");
     at("clear").hidden = !choice.conditions.size;
     at("sort").value = name;
@@ -67,6 +67,7 @@
     at("direction").setAttribute("aria-pressed", String(direction < 0));
     panel.refresh();
     grid.show(rows, name === "level_id" ? "steps_to_goal" : name);
+    if (page.row !== null) neighbours(page.row);
   }
 
   function changed() {
@@ -75,11 +76,21 @@
     refresh();
   }
 
+  // Link a level's page to the levels before and after it, among those chosen.
+  function neighbours(row) {
+    const index = rows ? rows.indexOf(row) : -1;
+    for (const [name, other] of [["previous", index - 1], ["next", index < 0 ? -1 : index + 1]]) {
+      if (rows && rows[other] !== undefined) at(name).href = hrefOf(rows[other]);
+      else at(name).removeAttribute("href");
+    }
+  }
+
   // Show what the address names.
   function follow() {
     const address = location.hash || "#";
     const id = address.match(/^#level=(-?\d+)$/);
     levelproof.report("");
+    waiting = false;
     if (!id) {
       const left = page.row;
       page.open(null);
@@ -96,7 +107,8 @@
     }
     const row = columns.numbers.get(Number(id[1]));
     if (row === undefined) {
-      if (columns.rows < columns.about.levels) return; // it may be on a page that is still loading
+      waiting = columns.rows < columns.about.levels; // it may be on a page that is still loading
+      if (waiting) return;
       history.replaceState(null, "", overview || "#");
       follow();
       levelproof.report(`There is no level ${id[1]} in this gallery.`);
@@ -105,13 +117,12 @@
     if (!at("overview").hidden) scrolled = scrollY;
     [at("overview").hidden, at("level").hidden] = [true, false];
     at("back").href = overview || "#";
-    const index = rows ? rows.indexOf(row) : -1;
-    for (const [name, other] of [["previous", index - 1], ["next", index < 0 ? -1 : index + 1]]) {
-      if (rows && rows[other] !== undefined) at(name).href = hrefOf(rows[other]);
-      else at(name).removeAttribute("href");
-    }
+    neighbours(row);
     scrollTo(0, 0);
-    page.open(row).then(() => at("level").focus({ preventScroll: true }), (error) => levelproof.report(error.message));
+    page.open(row).then(
+      () => { if (page.row === row) at("level").focus({ preventScroll: true }); },
+      (error) => { if (page.row === row) levelproof.report(error.message); },
+    );
   }
 
   function listen() {
@@ -126,7 +137,8 @@
     at("search").addEventListener("submit", (event) => {
       event.preventDefault();
       const id = at("level-id").value.trim();
-      if (/^-?\d+$/.test(id) && columns.numbers.has(Number(id))) location.hash = `level=${Number(id)}`;
+      const coming = columns.rows < columns.about.levels;
+      if (/^-?\d+$/.test(id) && (coming || columns.numbers.has(Number(id)))) location.hash = `level=${Number(id)}`;
       else levelproof.report(id ? `There is no level ${id} in this gallery.` : "Type the id of a level.");
     });
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
@@ -146,7 +158,10 @@
     at("facts").textContent = [`configuration ${about.config_hash}`, ...(about.where ? [`where ${about.where}`] : [])].join(" · ");
     const sorts = about.columns.filter((column) => !column.words).map((column) => column.name);
     at("sort").append(...sorts.map((name) => create("option", { value: name }, name === "level_id" ? "level id" : readable(name))));
-    if (innerWidth <= 820) at("panel").open = false;
+    const narrow = matchMedia("(max-width: 820px)"); // as in style.css, which shows how to open it only there
+    const fold = () => { at("panel").open = !narrow.matches; };
+    fold();
+    narrow.addEventListener("change", fold);
     listen();
     for (let number = 0; columns.rows < about.levels; number++) {
       columns.add(await load(`columns/${number}`));
@@ -157,9 +172,9 @@
         choose(overview);
       }
       refresh();
-      if (number === 0 || (at("overview").hidden && at("level").hidden)) follow();
+      if (number === 0 || waiting) follow();
     }
-    if (at("overview").hidden && at("level").hidden) follow();
+    if (waiting) follow();
     performance.mark("all columns are there");
   } catch (error) {
     levelproof.report(`${error.message}: write the gallery again with levelproof gallery.`);

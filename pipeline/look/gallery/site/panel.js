@@ -7,6 +7,7 @@
   const FIRST = ["steps_to_goal", "env_steps", "success_rate", "portability", "bodies", "joints", "motors", "thrusters"];
   const [FEW, SHORT] = [8, 24]; // maximum number of words, and of their letters, for buttons; else a list
   const [WIDE, HIGH] = [320, 46]; // size of a histogram's view box
+  const SLACK = 1e-9; // share of a bin by which ends of bins may be rounded
   const SVG = "http://www.w3.org/2000/svg";
 
   function create(tag, attributes = {}, ...inside) {
@@ -23,7 +24,7 @@
   const readable = (name) => name.replaceAll("_", " ");
 
   function formatted(value) {
-    if (Number.isInteger(value)) return value.toLocaleString("en");
+    if (Number.isInteger(value) || Math.abs(value) >= 1000) return Math.round(value).toLocaleString("en");
     return Number(value.toPrecision(3)).toString();
   }
 
@@ -80,6 +81,7 @@
       this.drawing = create("svg", {
         svg: true, viewBox: `0 0 ${WIDE} ${HIGH}`, preserveAspectRatio: "none", role: "img",
         pointerdown: (event) => this.begin(event), pointermove: (event) => this.drag(event), pointerup: () => this.end(),
+        pointercancel: () => { this.from = undefined; },
       }, this.all, this.brush, this.chosen);
       this.clear = create("button", { type: "button", "aria-label": `Clear ${readable(name)}`, click: () => this.choose(null) }, "clear");
       this.inputs = ["at least", "at most"].map((words, end) =>
@@ -96,8 +98,8 @@
     }
 
     begin(event) {
+      if (event.button) return;
       this.from = this.binAt(event);
-      this.wasChosen = this.choice.conditions.has(this.name);
       this.moved = false;
       this.drawing.setPointerCapture(event.pointerId);
     }
@@ -111,16 +113,18 @@
       this.choose(this.range(Math.min(this.from, to), Math.max(this.from, to)));
     }
 
-    // A click chooses one bin, or clears the range.
+    // A click chooses one bin.
     end() {
-      if (this.from !== undefined && !this.moved) this.choose(this.wasChosen ? null : this.range(this.from, this.from));
+      if (this.from !== undefined && !this.moved) this.choose(this.range(this.from, this.from));
       this.from = undefined;
     }
 
+    // The values of some bins, which do not include their upper end, except for the last one.
     range(first, last) {
-      const { low, high, width, whole } = this.bins;
+      const { low, high, width, whole, count } = this.bins;
       const end = low + (last + 1) * width;
-      return [low + first * width, Math.min(high, whole ? end - 1 : end)];
+      const upper = last === count - 1 ? high : whole ? Math.min(high, end - 1) : end - SLACK * width;
+      return [low + first * width, upper];
     }
 
     // Take the limit that was typed, 0 the lower or 1 the upper; the other stays.
@@ -128,6 +132,7 @@
       const all = [this.bins.low, this.bins.high];
       const range = [...(this.choice.conditions.get(this.name) || all)];
       range[end] = this.inputs[end].value === "" ? all[end] : Number(this.inputs[end].value);
+      if (range[0] > range[1]) range[1 - end] = range[end];
       this.choose(this.inputs.every((input) => input.value === "") ? null : range);
     }
 
@@ -151,7 +156,8 @@
       this.all.setAttribute("d", bars(all));
       const within = chosen.map((total, bin) => {
         const middle = low + (bin + 0.5) * width;
-        return range && (middle + width / 2 <= range[0] || middle - width / 2 > range[1]) ? 0 : total;
+        const slack = this.bins.whole ? 0 : SLACK * width;
+        return range && (middle + width / 2 <= range[0] + slack || middle - width / 2 > range[1]) ? 0 : total;
       });
       this.chosen.setAttribute("d", bars(within));
       const at = (value) => Math.min(WIDE, Math.max(0, ((value - low) / (count * width)) * WIDE));
