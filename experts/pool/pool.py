@@ -199,10 +199,10 @@ class Pool:
         training, evaluation = self._steps.split(took.seconds, sum(trains), slots.width)
         for train, (_, (submission, i, _)) in zip(trains, busy, strict=True):
             submission.ledger.put(*(("training", i, training) if train else ("evaluation", i, evaluation)))
-        # charge empty slots to the last submission, so that they count once
-        idle = slots.width - len(busy)
-        self._submissions[-1].idle_rollouts += idle
-        self._submissions[-1].ledger.add("idle", Lap(evaluation * idle, took.compiling))
+        # charge empty slots to one submission, so that they count once, and to one that has levels
+        idle, last = slots.width - len(busy), busy[-1][1].submission if busy else self._submissions[-1]
+        last.idle_rollouts += idle
+        last.ledger.add("idle", Lap(evaluation * idle, took.compiling))
 
     def _begin(self, levels: Level, level_ids: Int[np.ndarray, " level"], entrants: list[Entrant]) -> Slots:
         """Return slots with new experts, or with those that continue."""

@@ -20,7 +20,10 @@ Scalar = Int[Array, ""] | int
 
 
 class Draws(IntEnum):
-    """Searches that edit trajectories, each with its own random numbers. Go-Explore uses the stream's key itself."""
+    """Searches that edit trajectories, each with its own random numbers.
+
+    Go-Explore folds its env steps into the same key: 0, then many more than these.
+    """
 
     SHORTEN = 1
     POLISH = 2
@@ -64,7 +67,7 @@ def stretch(bits: UInt32[Array, ""], length: Int[Array, ""]) -> Int[Array, ""]:
 
 
 def some_of(live: Bool[Array, "6"], bits: UInt32[Array, ""]) -> Int[Array, ""]:
-    """Choose half of an action's live entries, as `Edit.entries`."""
+    """Choose each live entry of an action with probability 1/2, perhaps none, as `Edit.entries`."""
     return (live * (1 << jnp.arange(ACTIONS))).sum() & bits.astype(jnp.int32)
 
 

@@ -46,10 +46,11 @@ def attempts(
     def act(carry, key):
         acting, ended, shown, reached = carry
         acting, trajectory, _ = rollout(network, params, level, acting, key[None], manner, 1, rules)
-        state = acting.world.state
-        shown = jax.tree.map(lambda old, new: jnp.where(ended, old, new), shown, (state.position, state.rotation))
+        state, over = acting.world.state, ended | trajectory.done[0, 0]
+        # The rollout resets the world of an attempt that ends, so the poses before its last env step stay
+        shown = jax.tree.map(lambda old, new: jnp.where(over, old, new), shown, (state.position, state.rotation))
         reached |= ~ended & trajectory.goal[0, 0]
-        return (acting, ended | trajectory.done[0, 0], shown, reached), shown
+        return (acting, over, shown, reached), shown
 
     first = start(lanes)
     state = first.world.state

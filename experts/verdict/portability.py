@@ -115,6 +115,8 @@ def survivors(
 def moved(lanes: Level, level_ids: Int[Array, " level"], replays: int, number: Int[Array, ""] | int = 0) -> State:
     """Perturb first states: change each number of a movable body by -1, 0 or 1 unit in the last place.
 
+    Zeros stay: their neighbours are subnormal, and count as zero.
+
     Args:
         lanes: `replays` lanes per level, level by level.
         level_ids: ids of the levels.
