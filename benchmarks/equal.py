@@ -113,7 +113,7 @@ def run(args: argparse.Namespace) -> Report:
     page = "equal" if args.size == "s" else f"equal_{args.size}"
     head = ("policy", "seed", "pace", "env steps", "core-seconds before training", "in all", *SHARES)
     return Report(
-        "Learners at equal cost",
+        "Learners at equal cost" if args.size == "s" else f"Learners at equal cost, size {args.size}",
         results,
         [
             Table(head, rows, f"Share of sealed levels of {args.size} solved with sampled actions; 95% intervals"),
