@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -342,16 +343,9 @@ def test_small_campaign_runs_for_real(reference, level_file, tmp_path) -> None:
     code = "import sys; from benchmarks.__main__ import main; sys.exit(main())"
     command = [sys.executable, "-c", code, "parity", *options]
     environment = dict(os.environ) | {oracle.PYTHON_VARIABLE: str(reference)}
-    keep = ["--keep", str(tmp_path / "kept")]
-    done = subprocess.run(
-        [*command, *keep],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        env=environment,
-        check=False,
-        timeout=patience(1800),
-    )
+    words = [*command, "--keep", str(tmp_path / "kept")]
+    how: Any = {"capture_output": True, "text": True, "cwd": ROOT, "env": environment, "timeout": patience(1800)}
+    done = subprocess.run(words, **how)
     assert done.returncode == Exit.DONE, done.stderr
     result = json.loads(done.stdout)
     (one,) = result["sizes"]
@@ -364,15 +358,7 @@ def test_small_campaign_runs_for_real(reference, level_file, tmp_path) -> None:
     assert one["episodes"]["same"] >= 0.75
     assert result["versions"]["reference"]["jax2d"] == "1.0.1"
     assert "blocks" in done.stderr
-    again = subprocess.run(
-        [*command, *keep],
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        env=environment,
-        check=False,
-        timeout=patience(1800),
-    )
+    again = subprocess.run(words, **how)
     assert json.loads(again.stdout)["sizes"] == result["sizes"]  # from the kept answers
 
 
