@@ -60,6 +60,9 @@ DISTILLED = {
     "label, teachers": Distilled(
         "label", True, DISTILLING, "teachers, none of them an expert, label states that the learner itself gets into"
     ),
+    "masters, teachers": Distilled(
+        "masters", True, DISTILLING, "the levels' experts label these states, and the other teachers where they fail"
+    ),
     "masters, rollouts": Distilled(
         "masters",
         False,
