@@ -62,8 +62,7 @@ def searching(pool: Pool, size: Size) -> list[Program]:
     some = levels_of(size, width), ids_of(width)
     first = cache(lambda: explore.begin.eval_shape(*some, endless, rules))
     nearest = cache(lambda: vary.nearest_of.eval_shape(first().archive))
-    by_name = {"config": endless, "rules": rules}
-    again = cache(lambda: vary.begin.eval_shape(*some, nearest(), **by_name))
+    again = cache(lambda: vary.begin.eval_shape(*some, nearest(), endless))
     alone = at_once(config.lanes, ALONE)
     always = [
         Program(explore.begin, lambda: ((*some, endless, rules), {})),
@@ -74,7 +73,7 @@ def searching(pool: Pool, size: Size) -> list[Program]:
     ]
     variations = [
         Program(vary.nearest_of, lambda: ((first().archive,), {})),
-        Program(vary.begin, lambda: ((*some, nearest()), by_name)),
+        Program(vary.begin, lambda: ((*some, nearest(), endless), {})),
         entering(again, width, "variations"),
         Program(vary.vary_rounds, lambda: ((again(), config.ends, endless, rules), {})),
         Program(varied, lambda: ((again(),), ends)),

@@ -68,10 +68,7 @@ def strengthen(
         state = moved(few, level_ids, STARTS, now.number + 1)
         spread = lambda x: jnp.repeat(x.reshape(*x.shape[:-1], count, 1, STARTS), KEPT, -2).reshape(*x.shape[:-1], -1)
         start = fresh_walk(crowd.lanes)._replace(state=jax.tree.map(spread, state))
-        step = jnp.arange(RECORD_STEPS)
-        again = jnp.where(step < steps[..., None], step, step - steps[..., None])
-        whole = jnp.take_along_axis(new, jnp.clip(again, 0, RECORD_STEPS - 1), axis=2)
-        action = jnp.moveaxis(decode(whole.reshape(count * KEPT, -1).T), 0, 1)
+        action = jnp.moveaxis(decode(cycled(new, steps).reshape(count * KEPT, -1).T), 0, 1)
         until = jnp.repeat(jnp.where(reached & active[:, None], steps, 0).reshape(-1), STARTS)
         survived = survivors(crowd, start, jnp.repeat(action, STARTS, -1), until, rules).reshape(count, KEPT, STARTS)
         survived = jnp.where(reached, survived.sum(-1), -1)
@@ -85,3 +82,8 @@ def strengthen(
     start = Strengthening(code_of(success), success.length, success.length == 0, none, jnp.int32(0))
     end = jax.lax.while_loop(lambda now: (now.number < rounds) & ~now.robust.all(), one, start)
     return Shortened(success_of(end.code, end.length), end.env_steps)
+
+
+def cycled(code: UInt16[Array, "*some 256"], steps: Int[Array, "*some"]) -> UInt16[Array, "*some 256"]:
+    """Repeat the first `steps` codes to the end of the record, as a witness repeats its actions."""
+    return jnp.take_along_axis(code, jnp.arange(RECORD_STEPS) % steps[..., None], axis=-1)

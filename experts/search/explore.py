@@ -112,7 +112,7 @@ def explore_round(search: Search, ring: Arena, ends: StopLimits, config: SearchC
     closer = active & (least < NEARER * search.gap)
 
     env_steps = search.env_steps + jnp.where(active, config.steps_per_round, 0)
-    code, length = with_success(search.code, search.length, walk, code, active, rules)
+    code, length = with_success(search.code, search.length, walk, code, active)
     return Search(
         levels=search.levels,
         level_ids=search.level_ids,
@@ -203,10 +203,8 @@ def with_success(
     walk: Walk,
     played: UInt16[Array, "lane step"],
     active: Bool[Array, " level"],
-    rules: TaskParams,
 ) -> tuple[UInt16[Array, "level step"], Int[Array, " level"]]:
-    """Take the shortest success among each level's lanes, if one is in time; return codes and lengths."""
-    in_time = (walk.reached > 0) & (walk.reached <= most_steps(rules))
-    steps = jnp.where(in_time, walk.reached, RECORD_STEPS + 1).reshape(len(active), -1)
+    """Take the shortest success among each level's lanes, if there is one; return codes and lengths."""
+    steps = jnp.where(walk.reached > 0, walk.reached, RECORD_STEPS + 1).reshape(len(active), -1)
     won = active & (steps.min(-1) <= RECORD_STEPS)
     return best_lane(won, jnp.argmin(steps, axis=-1), (played.reshape(*steps.shape, -1), steps), (code, length))

@@ -146,7 +146,7 @@ class Searching:
         """Advance variations of the nearest trajectories."""
         slots, config, rules = self._varying, self._scaled, self._rules
         stacked = lambda entrants: jax.tree.map(lambda *xs: np.stack(xs), *(entrant.known for entrant in entrants))
-        begin = lambda levels, level_ids, some: vary.begin(levels, level_ids, stacked(some), config.endless, rules)
+        begin = lambda levels, level_ids, some: vary.begin(levels, level_ids, stacked(some), config.endless)
         advance = lambda rows: vary.vary(rows, config, rules)
         for slot, (job, index, _), result in stepped(slots, begin, advance, partial(varied, ends=config.ends)):
             success, env_steps = result

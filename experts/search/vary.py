@@ -74,13 +74,12 @@ def nearest_of(archive: Archive) -> Approaches:
     return first_of(Approaches(jnp.take_along_axis(entry.code, step, axis=-1), distance, entry.steps))
 
 
-@jit_quickly(static_argnames=("config", "rules"))
+@jit_quickly(static_argnames=("config",))
 def begin(
     levels: Level,
     level_ids: Int[Array, " level"],
     nearest: Approaches,
     config: SearchConfig,
-    rules: TaskParams,
 ) -> Varying:
     """Start variations from these trajectories.
 
@@ -89,7 +88,6 @@ def begin(
         level_ids: their ids, the seeds of all randomness.
         nearest: the nearest trajectories of each level.
         config: settings of the search.
-        rules: the task's rules.
     """
     count, steps = len(level_ids), nearest.code.shape[-1]
     state = to_rows(arena(levels, config.lanes, (1.0,)).lanes.state).reshape(count, config.lanes, -1)
@@ -129,7 +127,7 @@ def vary_round(varying: Varying, ring: Arena, ends: StopLimits, config: SearchCo
     state, timestep = by_level(to_rows(walk.state)), by_level(walk.timestep)
     over = by_level(walk.ended) | (timestep >= episodes.most)
     code = so_far.code.reshape(-1, so_far.code.shape[-1])
-    code, length = with_success(varying.code, varying.length, walk, code, active, rules)
+    code, length = with_success(varying.code, varying.length, walk, code, active)
 
     env_steps = varying.env_steps + jnp.where(active, config.steps_per_round, 0)
     closer = active & (nearest.gap[:, 0] < NEARER * varying.gap)

@@ -11,7 +11,7 @@ import pytest
 from benchmarks.alone import label
 from levelproof.experts.config import ExpertConfig, Rule, StopConfig
 from levelproof.experts.labels import Label, Source
-from levelproof.experts.pool.strengthen import strengthen
+from levelproof.experts.pool.strengthen import cycled, strengthen
 from levelproof.experts.procedure import Procedure
 from levelproof.experts.search.config import SearchConfig
 from levelproof.experts.search.explore import NEARER, Search, begin, draw, explore, explore_rounds, under_way
@@ -20,6 +20,7 @@ from levelproof.experts.search.play import arena, fresh_walk, play
 from levelproof.experts.search.search import AHEAD, Searching, SearchResult, side_by_side
 from levelproof.experts.search.shorten import shorten
 from levelproof.experts.steps import EnvSteps
+from levelproof.experts.verdict.judge import repeated
 from levelproof.experts.witness.success import Success
 from levelproof.experts.witness.witness import replay
 from levelproof.levelgen.batching import take
@@ -340,6 +341,14 @@ def delayed(at: np.ndarray) -> Success:
     given.action[0, 20:] = known.action[0, :-20]
     given.length[0] += 20
     return given
+
+
+def test_strengthening_plays_what_a_witness_repeats() -> None:
+    """Replays go on for some env steps after the witness's last, which is several repeats of a short one."""
+    steps = np.array([1, 2, 7, 16, 100, 255, 256, 257])  # the last: no success
+    code = np.arange(len(steps) * 256, dtype=np.uint16).reshape(len(steps), 256)
+    for row, one, length in zip(np.asarray(cycled(code, steps)), code, steps.tolist(), strict=True):
+        np.testing.assert_array_equal(row, repeated(one, length))
 
 
 @pytest.mark.slow

@@ -57,7 +57,7 @@ def misses() -> Approaches:
 
 
 def begun() -> Varying:
-    return begin(levels(), IDS, misses(), CONFIG, DEFAULT_RULES)
+    return begin(levels(), IDS, misses(), CONFIG)
 
 
 @cache
@@ -127,7 +127,7 @@ def test_nearest_trajectories_replay_to_their_gaps() -> None:
 def test_result_depends_on_the_level_alone() -> None:
     """The search slot and the neighbours differ."""
     order = np.roll(np.arange(WIDTH), 1)
-    now = begin(take(levels(), order), IDS[order], misses(), CONFIG, DEFAULT_RULES)
+    now = begin(take(levels(), order), IDS[order], misses(), CONFIG)
     for _ in range(3):
         now = vary(now, CONFIG, DEFAULT_RULES)
     straight = begun()
