@@ -28,7 +28,7 @@ KEY_EVERY = 32  # default env steps between key frames
 KEYS_EVERY = tuple(2**i for i in range(1, 9))  # allowed values: each divides a record's 256 steps
 MAX_FRAME_SKIP = 64  # for densities whose readers re-simulate records
 MAX_BODIES = 48  # the largest number that was tested; compiling takes minutes at that size
-# (most bodies, levels of an untimed work unit): units take about equally long, and their levels are multiples of the
+# (maximum bodies, levels of an untimed work unit): units take about equally long, and their levels are multiples of the
 # number of experts that train side by side
 UNITS = ((SIZES["s"].bodies, 32), (SIZES["m"].bodies, 16), (SIZES["l"].bodies, 8), (MAX_BODIES, 4))
 GROWN_UNIT = 8  # size of a unit that grows records from seeds, as a multiple of a unit that trains

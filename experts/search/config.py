@@ -31,7 +31,7 @@ class SearchConfig:
     """Settings of a search (hashable: pass as a static argument)."""
 
     env_steps: int = 1_048_576  # per level, over all lanes; rounded up to whole rounds; 0: no search
-    bodies: int = 0  # most bodies of a world that gets all env steps; one of n gets (bodies/n)² of them; 0: no scaling
+    bodies: int = 0  # worlds up to this many bodies get all env steps; n bodies get (bodies/n)² of them; 0: no scaling
     variations: int = 262_144  # env steps after the search, on variations of the nearest trajectories; 0: none
     patience: int = 524_288  # env steps without progress before a level leaves (variations: a quarter); 0: no limit
     patience_gap: float = 0.1  # m, gap of green and blue beyond which patience falls as 1/gap, to a quarter; 0: never
