@@ -20,6 +20,9 @@ class Outlet:
     def write(self, text: str) -> int:
         try:
             return self._stream.write(text)
+        except UnicodeEncodeError:  # a path that is not UTF-8, or a terminal that knows few characters
+            encoding = self._stream.encoding
+            return self._stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
         except self._ignored:
             self._drop()
             return len(text)
@@ -45,16 +48,17 @@ class Outlet:
 def outlets() -> Iterator[None]:
     """Wrap both standard streams in outlets for the `with` block, and flush them at its end.
 
-    That flush ignores errors: the command itself flushes earlier, while it can still report them.
+    That flush ignores errors: the command itself flushes earlier, while it can still report them. A stream is None if
+    the process started with its descriptor closed: the null device then takes its place, and in most processes its
+    descriptor, which the next opened file would get otherwise.
     """
     with ExitStack() as stack:
         # Progress and messages may be lost, but not results
         both = (sys.stdout, redirect_stdout, BrokenPipeError), (sys.stderr, redirect_stderr, OSError)
         for stream, redirect, ignored in both:
-            if stream is not None:  # None if the process started with the descriptor closed
-                outlet = Outlet(stream, ignored)
-                stack.callback(_flush, outlet)
-                stack.enter_context(redirect(cast(TextIO, outlet)))
+            outlet = Outlet(stream or stack.enter_context(open(os.devnull, "w")), ignored)
+            stack.callback(_flush, outlet)
+            stack.enter_context(redirect(cast(TextIO, outlet)))
         yield
 
 

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from levelproof.pipeline.cli.command import SPLIT, add_json
+from levelproof.pipeline.cli.command import SPLIT, add_json, row_count
 
 SUMMARY = "compare two splits of the same levels: which are solved, at what cost"
 EXAMPLE = "levelproof diff data/128k/s data/256k/s"
@@ -15,7 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     where = "compare only levels that meet this condition on the first manifest's columns"
     parser.add_argument("--where", metavar="SQL", help=where)
     rows = "number of levels to list that only one split solved (default: 10)"
-    parser.add_argument("--rows", type=int, default=10, help=rows)
+    parser.add_argument("--rows", type=row_count, default=10, help=rows)
     add_json(parser)
 
 

@@ -17,6 +17,7 @@ levelproof export data/128k/s --format parquet -o t    a table of levels and man
 levelproof export data/128k/s --format seed -o s.parquet    14 to 37 bytes per solved level
 levelproof export manifests/256k/s-handmade --format seed --levels handmade -o handmade.parquet"""
 JSON = "json"  # for one level; the other formats take a split
+LEVEL = Path("level.json")  # its default
 WHERE = (
     "only levels that meet this condition on the manifest's columns "
     "(default: label = 'solved'; for parquet and seed, all levels)"
@@ -77,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="level files of the levels that a seed file lacks; `handmade`: those of the reference, "
         "even if a folder has that name",
     )  # fmt: skip
-    parser.add_argument("-o", "--out", type=Path, help=f"file or folder to write (default for {JSON}: level.json)")
+    parser.add_argument("-o", "--out", type=Path, help=f"file or folder to write (default for {JSON}: {LEVEL})")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -94,7 +95,9 @@ def run(arguments: argparse.Namespace) -> None:
             )
         from levelproof.pipeline.exchange.level_json import export
 
-        export(split, level_id, out or Path("level.json"))
+        if out is None and LEVEL.exists():
+            raise UserError(f"{LEVEL} already exists: name the file to write with -o, as in -o level-{level_id}.json.")
+        export(split, level_id, out or LEVEL)
         return
     if level_id is not None:
         raise UserError(

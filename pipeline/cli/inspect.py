@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from levelproof.pipeline.cli.command import add_json, add_split
+from levelproof.pipeline.cli.command import add_json, add_split, row_count
 from levelproof.pipeline.errors import UserError
 
 SUMMARY = "show the contents of a split"
@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--against", type=Path, action="append", default=[], metavar="PATH", help=AGAINST)
     parser.add_argument("--columns", metavar="NAMES", help=COLUMNS)
     parser.add_argument("--sort", metavar="SQL", help=SORT)
-    parser.add_argument("--limit", "--rows", type=int, metavar="COUNT", help=LIMIT)
+    parser.add_argument("--limit", "--rows", type=row_count, metavar="COUNT", help=LIMIT)
     output = parser.add_mutually_exclusive_group()
     add_json(output)
     output.add_argument("--csv", action="store_true", help="print only the rows, as CSV")

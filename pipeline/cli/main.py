@@ -4,6 +4,7 @@ Imports nothing heavy before it knows the command, so that `levelproof --help` a
 """
 
 import argparse
+import errno
 import sys
 import warnings
 from collections.abc import Sequence
@@ -23,6 +24,9 @@ NAMES = (
 )
 # Checks of arguments that are paths; those of other names must not be URLs of an unsupported kind
 CHECKS = {"out": require_here, "plot": require_here, "policy": require_policy, "against": require_policy}
+MOST_DIGITS = 20  # of a level id; int() refuses thousands
+UNUSABLE = errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP  # errors of paths that the user named
+LONG = 200  # characters of a path that are shown
 COMMANDS = [import_module(f"levelproof.pipeline.cli.{name}") for name in NAMES.split()]
 
 
@@ -41,8 +45,7 @@ def _run(argv: Sequence[str] | None) -> int:
             raise UserError(_no_option(unknown[0], takes_settings=bool({"settings", "words"} & vars(arguments).keys())))
         _check_paths(arguments)
         code = int(arguments.run(arguments) or Exit.DONE)
-        if sys.stdout:
-            sys.stdout.flush()  # now, so that a full disk is reported as an error
+        sys.stdout.flush()  # now, so that a full disk is reported as an error
         return code
     except (LevelproofError, ConfigError) as error:
         if arguments.debug:
@@ -53,10 +56,16 @@ def _run(argv: Sequence[str] | None) -> int:
     except Exception as error:
         if arguments.debug:
             raise
-        lines = str(error).strip().splitlines()
-        return _report(
-            f"{type(error).__name__}: {lines[0] if lines else 'no message'} (--debug shows where)", Exit.FAILED
-        )
+        return _report(*_unforeseen(error))
+
+
+def _unforeseen(error: Exception) -> tuple[str, int]:
+    """Return the sentence and the exit code for an error that no code has turned into a LevelproofError."""
+    if isinstance(error, OSError) and error.errno in UNUSABLE and isinstance(path := error.filename, str):
+        shown = path if len(path) <= LONG else f"{path[:LONG]}..."
+        return f"Cannot use {shown} ({error.strerror}): check the path and its permissions", Exit.INPUT
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0] if lines else 'no message'} (--debug shows where)", Exit.FAILED
 
 
 def _taken(arguments: argparse.Namespace, unknown: list[str]) -> list[str]:
@@ -67,7 +76,8 @@ def _taken(arguments: argparse.Namespace, unknown: list[str]) -> list[str]:
         if hasattr(arguments, name):
             setattr(arguments, name, [*getattr(arguments, name), *map(kind, unknown)])
             return []
-    if len(unknown) == 1 and unknown[0].isdecimal() and getattr(arguments, "level_id", 0) is None:
+    number = len(unknown) == 1 and unknown[0].isdecimal() and len(unknown[0]) < MOST_DIGITS
+    if number and getattr(arguments, "level_id", 0) is None:
         arguments.level_id = int(unknown[0])
         return []
     return unknown

@@ -53,7 +53,7 @@ ALWAYS_FIELDS = ("record/action", "record/reward", "record/done", "record/goal")
 def open(
     path: str | os.PathLike[str],
     where: str | None = None,
-    columns: Sequence[str] = (),
+    columns: Sequence[str] | str = (),
     validation: float = 0.1,
     differing: str = KEEP,
 ) -> "Dataset":
@@ -94,14 +94,14 @@ class Dataset:
         self,
         split: Path,
         where: str | None,
-        columns: Sequence[str],
+        columns: Sequence[str] | str,
         validation: float,
         differing: str = KEEP,
         fingerprint: str | None = None,
     ) -> None:
         self.split, self._opened_with = split, (split, where, columns, validation, differing)
-        self._validation, self._differing = validation, Differing(split, differing)
         check_share(validation)
+        self._validation, self._differing = float(validation), Differing(split, differing)
         self._trajectories = TrajectoryRows(split, where, columns, fingerprint)
         self._shard = lru_cache(OPEN_SHARDS)(open_shard)
         self.rules, self.simulates = self._trajectories.rules, self._trajectories.simulates

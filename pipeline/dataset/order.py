@@ -6,6 +6,7 @@ finaliser of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014) as its round functi
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -26,14 +27,17 @@ class EpochOrder:
     process_count: int = 1
 
     def __post_init__(self) -> None:
+        for name in ("batch_size", "seed", "process_index", "process_count"):
+            object.__setattr__(self, name, plain(getattr(self, name)))
         if not (type(self.batch_size) is int and self.batch_size > 0):
             raise UserError(f"A batch cannot have {self.batch_size} items: use an integer from 1.")
-        if not 0 <= self.process_index < self.process_count:
+        process = self.process_index, self.process_count
+        if not (all(type(number) is int for number in process) and 0 <= self.process_index < self.process_count):
             raise UserError(
                 f"There is no process {self.process_index} of {self.process_count}: "
                 "process_index must be from 0 to process_count - 1."
             )
-        if self.seed is not None and self.seed < 0:
+        if self.seed is not None and not (type(self.seed) is int and self.seed >= 0):
             raise UserError(f"The seed is {self.seed}: use an integer from 0, or None for no shuffling.")
 
     @property
@@ -57,6 +61,11 @@ class EpochOrder:
             for epoch in np.unique(epochs).tolist():
                 items[epochs == epoch] = permute(items[epochs == epoch], self.count, self.seed, epoch)
         return items.ravel(), ranks.ravel() < self.count
+
+
+def plain(value: Any) -> Any:
+    """Return numpy's integer as Python's, which JSON can hold; other values unchanged."""
+    return int(value) if isinstance(value, np.integer) else value
 
 
 def permute(positions: Int[np.ndarray, "*n"], count: int, seed: int, epoch: int = 0) -> Int[np.ndarray, "*n"]:

@@ -10,7 +10,7 @@ SAMPLE = Path(__file__).parent / "sample.parquet"  # manifests/README.md says ho
 
 
 def sample_data(
-    where: str | None = None, columns: Sequence[str] = (), validation: float = 0.1, differing: str = KEEP
+    where: str | None = None, columns: Sequence[str] | str = (), validation: float = 0.1, differing: str = KEEP
 ) -> Dataset:
     """Open the trajectories that come with levelproof: levels 0 to 9,999 of size s, labelled at 256k env steps.
 

@@ -40,14 +40,17 @@ class TrajectoryRows:
         of_seeds: whether they are those of seed files.
     """
 
-    def __init__(self, split: Path, where: str | None, columns: Sequence[str], fingerprint: str | None = None) -> None:
+    def __init__(
+        self, split: Path, where: str | None, columns: Sequence[str] | str, fingerprint: str | None = None
+    ) -> None:
         """Read the manifest; other arguments and errors as `dataset.open`.
 
         With the `fingerprint` of the trajectories that another process opened, use the table that it shared, if any.
         """
         self._split, self._lock, self.of_seeds = split, Lock(), is_seed(split)
         hashed = [] if self.of_seeds else ["content_hash"]  # of seeds on demand: it takes their levels
-        columns = [*hashed, *ALWAYS_COLUMNS, *columns, *columns_in(where)]
+        named = [columns] if isinstance(columns, str) else columns
+        columns = [*hashed, *ALWAYS_COLUMNS, *named, *columns_in(where)]
         self._kind = f"trajectories with {columns}"
         found = None if fingerprint is None else self._found(self._kind, fingerprint)
         if found is None:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from levelproof.experts.config import RECORD_STEPS
+from levelproof.pipeline.dataset.order import plain
 from levelproof.pipeline.errors import UserError
 
 
@@ -22,6 +23,7 @@ class Windows(NamedTuple):
         Raises:
             UserError: `length` is not an integer from 1 to the steps of a record.
         """
+        length = plain(length)
         if length is not None and not (type(length) is int and 0 < length <= RECORD_STEPS):
             raise UserError(f"A window cannot have {length} steps: use 1 to {RECORD_STEPS}, or None for whole records.")
         return Windows(length or RECORD_STEPS)

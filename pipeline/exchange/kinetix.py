@@ -10,9 +10,9 @@ from levelproof.pipeline.read.kinetix.zarr2 import ROWS, write_array, write_chun
 from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.read.select import SOLVED, select_witnessed
 from levelproof.pipeline.runtime import prepare_jax
-from levelproof.pipeline.store.bar import with_bar
 from levelproof.pipeline.store.created import new_folder
 from levelproof.pipeline.store.fields import tree_of
+from levelproof.pipeline.store.progress_bar import shown_blocks
 from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.shard import stored_bytes
 from levelproof.pipeline.words import many
@@ -32,7 +32,7 @@ def export_kinetix(split: Path, where: str | None, out: Path) -> None:
     rows = select_witnessed(split, where or SOLVED)
     count = rows.num_rows
     with new_folder(out) as folder:
-        for first in with_bar(range(0, count, BLOCK), "trajectories"):
+        for first in shown_blocks(count, BLOCK, "trajectories"):
             fields = read_rows(split, rows.slice(first, BLOCK))
             trajectories = trajectories_of(tree_of(Level, fields, "level/"), tree_of(Record, fields, "record/"))
             array, at = divmod(first, ARRAY)

@@ -6,6 +6,7 @@ from levelproof.levelgen.files.level_file import LevelFile, LevelFileError, writ
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.read.levels import find_level, levels_of, rules_of, writing_to
 from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store.files import replacing
 
 
 def export(split: Path, level_id: int, out: Path) -> None:
@@ -21,8 +22,8 @@ def export(split: Path, level_id: int, out: Path) -> None:
     manifest, row = find_level(split, level_id)
     file = LevelFile(levels_of(manifest, manifest.table), rules_of(manifest))
     try:
-        with writing_to(out):
-            write_level_file(file, out)
+        with writing_to(out), replacing(out) as unfinished:
+            write_level_file(file, unfinished)
     except LevelFileError as error:
         raise UserError(f"Cannot export level {level_id} of {split}: {error}.") from None
     print(f"{out}: level {level_id} of size {row['size']}, for Kinetix")

@@ -4,6 +4,7 @@
 """
 
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +17,12 @@ from levelproof.levelgen.identity.content import content_hashes
 from levelproof.levelgen.sampling.sampler import CHUNK
 from levelproof.pipeline.exchange.tables import columns_for
 from levelproof.pipeline.read.levels import levels_of
-from levelproof.pipeline.read.progress_bar import ProgressBar
 from levelproof.pipeline.read.select import columns_in, select_some
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.columns import COLUMNS
 from levelproof.pipeline.store.created import new_folder
 from levelproof.pipeline.store.manifest import Manifest, require_manifest, settings_metadata
+from levelproof.pipeline.store.progress_bar import ProgressBar
 from levelproof.pipeline.words import many
 
 GROUP = 16 * CHUNK  # rows per row group: those in memory at a time, and the unit that a query reads or skips
@@ -94,7 +95,7 @@ def _write(path: Path, groups: Iterator[pa.Table], metadata: dict[bytes, bytes])
         use_dictionary=STRING_COLUMNS,  # pyright: ignore[reportArgumentType]  # dictionaries of numbers would merge all NaN
         write_page_checksum=True,
     ) as file:
-        for table in (first, *groups):
+        for table in chain([first], groups):
             file.write_table(table, row_group_size=GROUP)
             count += table.num_rows
     return count

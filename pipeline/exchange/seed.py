@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 import pyarrow as pa
+from rich.console import Console
 
 from levelproof.configs.schema import REPEATED, from_files
 from levelproof.experts.labels import Label
@@ -23,12 +24,12 @@ from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.read.select import columns_in, select_some
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store import files
-from levelproof.pipeline.store.bar import with_bar
 from levelproof.pipeline.store.contents import table_for
 from levelproof.pipeline.store.density import LAST_DISTANCE, MOVES, STATE, task_states
 from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 from levelproof.pipeline.store.origins import RECORD
+from levelproof.pipeline.store.progress_bar import ProgressBar
 from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.seed.columns import KEPT, ROW_GROUP, SCHEMA
 from levelproof.pipeline.store.seed.file import SUFFIX
@@ -70,9 +71,10 @@ def export_seed(split: Path, where: str | None, out: Path, with_levels: bool = T
     config = {**(manifest.config or {}), **REPEATED}
     LevelSource.require_readable(config, split)
     with writing_to(out):
-        firsts = with_bar(range(0, rows.num_rows, ROW_GROUP), "row groups")
-        groups = (_group(manifest, rows.slice(first, ROW_GROUP), with_levels) for first in firsts)
-        data = seed_bytes(groups, config, rows["budget"][0].as_py())
+        with ProgressBar("levels", rows.num_rows, Console(stderr=True)) as bar:
+            parts = (rows.slice(first, ROW_GROUP) for first in range(0, rows.num_rows, ROW_GROUP))
+            groups = (_group(manifest, part, with_levels, bar) for part in parts)
+            data = seed_bytes(groups, config, rows["budget"][0].as_py())
         files.write(out, data)
     solved = manifest.counts(np.isin(manifest.level_ids, rows["level_id"].to_numpy())).get(Label.SOLVED, 0)
     each = f", {len(data) / solved:.1f} bytes per solved one" if solved else ""
@@ -106,8 +108,8 @@ def _without_folder(rows: pa.Table, split: Path) -> pa.Table:
     return rows.set_column(rows.schema.get_field_index("file"), "file", [pa.array(below, pa.string())])
 
 
-def _group(manifest: Manifest, rows: pa.Table, with_levels: bool) -> tuple[pa.Table, list[str]]:
-    """Return a row group, and the content hashes of its levels."""
+def _group(manifest: Manifest, rows: pa.Table, with_levels: bool, bar: ProgressBar) -> tuple[pa.Table, list[str]]:
+    """Return a row group, and the content hashes of its levels; `bar` counts its rows."""
     columns: dict[str, Any] = {name: rows.column(name) for name in ("level_id", *KEPT)}
     columns |= {"source": rows.column("witness"), "label_reason": _reasons(rows), "made_with": _made_with(rows)}
     witnessed = np.flatnonzero(rows.column("shard").is_valid())
@@ -115,11 +117,13 @@ def _group(manifest: Manifest, rows: pa.Table, with_levels: bool) -> tuple[pa.Ta
     for first in range(0, len(witnessed), CHUNK):
         some = witnessed[first : first + CHUNK]
         witness[some], checksum[some] = _witnesses(manifest, rows.take(some))
+        bar.advance(len(some))
     columns["witness"] = pa.array(witness.tolist(), pa.binary())
     columns["checksum"] = pa.array(checksum, mask=~rows.column("shard").is_valid().to_numpy())
     content = _content(manifest, rows) if with_levels else [None] * rows.num_rows
     columns["content"] = pa.array(list(content), pa.binary())
     table = pa.table({name: _plain(columns[name]) for name in SCHEMA.names}, schema=SCHEMA)
+    bar.advance(rows.num_rows - len(witnessed))
     return table, rows.column("content_hash").to_pylist()
 
 

@@ -12,7 +12,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 from levelproof.experts.steps import NO_SECONDS, EnvSteps, Seconds
 from levelproof.pipeline.jobs.schedule import Round, Summary, WorkUnit
-from levelproof.pipeline.read.progress_bar import LINE_EVERY
+from levelproof.pipeline.store.progress_bar import LINE_EVERY
 from levelproof.pipeline.words import duration
 
 LINE_AFTER = 2.0  # s between plain lines that report commits; the last commit is always reported

@@ -38,8 +38,8 @@ from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.pace import Pace
 from levelproof.pipeline.learn.pool import Feed, PartedSplit, validation_batches
 from levelproof.pipeline.learn.sealed import require_not_sealed, without_sealed
-from levelproof.pipeline.read.progress_bar import ProgressBar
 from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store.progress_bar import ProgressBar
 from levelproof.pipeline.words import duration
 
 SOLVED = "eval/sampled_episode_solve_rate"

@@ -46,8 +46,8 @@ from levelproof.pipeline.learn.pool import read_pool
 from levelproof.pipeline.learn.rounds import TaughtLevels, teach
 from levelproof.pipeline.learn.sealed import require_not_sealed, require_some_usable, without_sealed
 from levelproof.pipeline.read.policies import policy_at, require_size
-from levelproof.pipeline.read.progress_bar import ProgressBar
 from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store.progress_bar import ProgressBar
 from levelproof.pipeline.words import duration
 
 COURSE = Curves(

@@ -34,8 +34,8 @@ from levelproof.pipeline.learn.specialists import Specialists, sealed_specialist
 from levelproof.pipeline.read.agents import SUFFIX as AGENT_SUFFIX
 from levelproof.pipeline.read.agents import Agent, agent_in
 from levelproof.pipeline.read.policies import policy_at, require_size
-from levelproof.pipeline.read.progress_bar import ProgressBar
 from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store.progress_bar import ProgressBar
 from levelproof.pipeline.words import many
 
 ATTEMPTS = 8

@@ -21,11 +21,11 @@ from levelproof.experts.networks.saved import CONFIG, WEIGHTS, Policy, named, po
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.learn.metrics import METRICS
-from levelproof.pipeline.read.progress_bar import LINE_EVERY
 from levelproof.pipeline.store.disk import NotRegular, explaining_writes, read_regular
 from levelproof.pipeline.store.files import write
 from levelproof.pipeline.store.locks import only_trainer
 from levelproof.pipeline.store.manifest import changes_text, differences
+from levelproof.pipeline.store.progress_bar import LINE_EVERY
 from levelproof.pipeline.store.provenance import device, versions
 
 CHECKPOINT, RUN = "checkpoint.safetensors", "run.json"

@@ -27,7 +27,7 @@ from levelproof.pipeline.look.readme import FIGURES, MARK, PREVIEW, RATES, SHEET
 from levelproof.pipeline.read.levels import distribution_of, writing_to
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.disk import NotRegular
-from levelproof.pipeline.store.files import write
+from levelproof.pipeline.store.files import replacing, write
 from levelproof.pipeline.store.layout import SHARDS
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 from levelproof.pipeline.store.named import bytes_named
@@ -58,6 +58,7 @@ def card(splits: Sequence[Path], out: Path | None, options: CardOptions) -> None
             without `out`, or the file exists and is not a card.
         Failure: a split is damaged.
     """
+    splits = list(dict.fromkeys(splits))
     root, remote = _above(splits[0]), is_remote(splits[0])
     if remote and out is None:
         raise UserError(
@@ -72,13 +73,15 @@ def card(splits: Sequence[Path], out: Path | None, options: CardOptions) -> None
     paths = [_below(root if remote else folder, split) for split in splits]
     manifests = [require_manifest(split, COLUMNS_READ, compact=True) for split in splits]
     facts = [_facts(path, manifest) for path, manifest in zip(paths, manifests, strict=True)]
+    _require_own_names(facts)
     with writing_to(out):
         for name in (PREVIEW, FIGURES):
             (folder / name).mkdir(parents=True, exist_ok=True)
             _require_plain([folder / name, *(folder / name).iterdir()])
         tables = [preview(manifest, SAMPLE) for manifest in manifests]
         for split_facts, table in zip(facts, tables, strict=True):
-            pq.write_table(table, folder / PREVIEW / f"{split_facts.subset}.parquet", row_group_size=100)
+            with replacing(folder / PREVIEW / f"{split_facts.subset}.parquet") as unfinished:
+                pq.write_table(table, unfinished, row_group_size=100)
         figures = _draw(folder, facts, tables)
         name = options.name or (options.repo or (root if remote else folder).name.partition("@")[0]).rpartition("/")[2]
         write(out, readme(name, facts, options, figures, __version__).encode())
@@ -104,6 +107,14 @@ def _above(split: Path) -> Path:
 def _require_ours(out: Path) -> None:
     if out.exists() and not (out.is_file() and MARK in out.read_text(encoding="utf-8", errors="replace")):
         raise UserError(f"{out} exists, but `levelproof card` did not write it: name another file with -o.")
+
+
+def _require_own_names(facts: Sequence[SplitFacts]) -> None:
+    """Refuse splits whose subsets on the hub, and previews, would have the same name."""
+    paths: dict[str, str] = {}
+    for split in facts:
+        if (other := paths.setdefault(split.subset, split.path)) != split.path:
+            raise UserError(f"Both {other} and {split.path} would be the subset {split.subset}: rename one of them.")
 
 
 def _require_plain(paths: Iterable[Path]) -> None:
@@ -184,13 +195,16 @@ def _draw(folder: Path, facts: Sequence[SplitFacts], tables: Sequence[pa.Table])
     each = -(-SHEET_LEVELS // len(goals))
     if chosen := list(chain(*(pictures[:each] for pictures in goals)))[:SHEET_LEVELS]:
         pictures = [Image.open(io.BytesIO(goal["bytes"])) for goal in chosen]
-        write_png(sheet(pictures, COLUMNS), folder / SHEET)
+        with replacing(folder / SHEET) as unfinished:
+            write_png(sheet(pictures, COLUMNS), unfinished)
         drawn.append(SHEET)
     if shares := {split.path: split.solved for split in facts if split.solved}:
-        draw_shares(shares, "Share solved of the levels that were trained or searched", folder / RATES)
+        with replacing(folder / RATES) as unfinished:
+            draw_shares(shares, "Share solved of the levels that were trained or searched", unfinished)
         drawn.append(RATES)
     if steps := {split.path: split.steps_to_goal for split in facts if len(split.steps_to_goal)}:
         title = f"Steps to goal of solved levels (bins of {RECORD_STEPS // BINS})"
-        draw_panels(steps, {}, BINS, title, folder / STEPS, RECORD_STEPS)
+        with replacing(folder / STEPS) as unfinished:
+            draw_panels(steps, {}, BINS, title, unfinished, RECORD_STEPS)
         drawn.append(STEPS)
     return drawn

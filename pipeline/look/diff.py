@@ -73,7 +73,7 @@ def compare(one: Path, other: Path, where: str | None = None, rows: int = 10) ->
         "neither": int((~solved[0] & ~solved[1] & tried).sum()),
         "only": [int(mask.sum()) for mask in only],
         "p": exact_p(*(int(mask.sum()) for mask in only)),
-        "only_rows": [ids[mask][: max(rows, 0)].tolist() for mask in only],
+        "only_rows": [ids[mask][:rows].tolist() for mask in only],
         "labels": _label_changes(left, right),
         "env_steps": spent,
         "env_steps_for_one_more": (totals[1] - totals[0]) / gained if gained and all(spent) else None,

@@ -61,7 +61,7 @@ def survey(
     columns = [*READ, *cost.READ, *columns_in(query.where), *columns_in(query.sort)]
     hashed = partial(duplicates.hash_identities, kept=columns)
     manifest = require_manifest(split, [*columns, *duplicates.COMPARED], compact=True, each=hashed)
-    query = query._replace(limit=LIMIT if query.limit is None else max(query.limit, 0))
+    query = query._replace(limit=LIMIT if query.limit is None else query.limit)
     candidates = duplicates.find_candidates(manifest.table)
     manifest = replace(
         manifest, table=manifest.table.drop_columns([*duplicates.NUMBERS])

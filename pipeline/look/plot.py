@@ -12,6 +12,7 @@ from levelproof.pipeline.look.query import RowQuery, prepare_for_seeds
 from levelproof.pipeline.look.spread import spread
 from levelproof.pipeline.read.levels import writing_to
 from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.store.files import replacing
 from levelproof.pipeline.store.manifest import require_manifest
 from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.words import many
@@ -40,8 +41,8 @@ def plot(split: Path, query: RowQuery, out: Path) -> None:
     curves = {f"{label} levels, success rate": rates for label, rates in drawn.items() if rates}
     if not values and not curves:
         raise UserError(f"{split} has nothing to draw: choose other rows with --where.")
-    with writing_to(out):
-        draw_panels(values, curves, BINS, f"{as_typed(split)}: {many(table.num_rows, 'level')}", out)
+    with writing_to(out), replacing(out) as unfinished:
+        draw_panels(values, curves, BINS, f"{as_typed(split)}: {many(table.num_rows, 'level')}", unfinished)
     print(f"{out}: {', '.join([*values, *curves])}")
 
 

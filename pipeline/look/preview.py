@@ -17,10 +17,10 @@ from levelproof.pipeline.look.show import recorded_film
 from levelproof.pipeline.look.spread import spread
 from levelproof.pipeline.read.levels import levels_of, rules_of
 from levelproof.pipeline.read.rows import read_rows
-from levelproof.pipeline.store.bar import with_bar
 from levelproof.pipeline.store.columns import COLUMNS
 from levelproof.pipeline.store.contents import table_for
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
+from levelproof.pipeline.store.progress_bar import shown_blocks
 
 PICTURES = ("start", "goal")  # the initial world; the moment the witness reaches the goal, or null
 SHOWN = (  # manifest columns beside the pictures
@@ -48,7 +48,7 @@ def preview(manifest: Manifest, count: int) -> pa.Table:
     ids = manifest.level_ids
     chosen = ids[spread(len(ids), count)]
     full = require_manifest(manifest.split, level_ids=chosen.tolist())
-    blocks = with_bar(range(0, full.table.num_rows, BLOCK), f"pictures of {manifest.split}")
+    blocks = shown_blocks(full.table.num_rows, BLOCK, f"pictures of {manifest.split}")
     rows = [row for first in blocks for row in _pictured(full, full.table.slice(first, BLOCK))]
     return pa.Table.from_pylist(rows, SCHEMA)
 

@@ -9,12 +9,15 @@ from typing import IO, Any, NamedTuple
 import duckdb
 import numpy as np
 import pyarrow as pa
+from rich.console import Console
 
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.outlet import has_reader
 from levelproof.pipeline.read.select import TABLE, columns_in, select
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.columns import COLUMNS, with_current_names
 from levelproof.pipeline.store.manifest import require_manifest
+from levelproof.pipeline.store.progress_bar import ProgressBar
 from levelproof.pipeline.store.seed.file import is_seed
 
 BLOCK = 2**14  # rows read at a time
@@ -58,7 +61,7 @@ def ids_of(table: pa.Table, query: RowQuery) -> np.ndarray:
                 raise UserError(
                     f"Cannot sort by {query.sort!r} ({reason}): give a column, or one such as 'steps_to_goal DESC'."
                 ) from None
-    return ids if query.limit is None else ids[: max(query.limit, 0)]
+    return ids if query.limit is None else ids[: query.limit]
 
 
 def rows_of(split: Path, ids: np.ndarray, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
@@ -90,8 +93,13 @@ def write_csv(split: Path, query: RowQuery, out: IO[str]) -> None:
     )
     names, writer = list(query.columns or COLUMNS.names), csv.writer(out, lineterminator="\n")
     writer.writerow(names)
-    for block in rows_of(split, ids_of(table, query), names):
-        writer.writerows([_cell(value) for value in row.values()] for row in block.to_pylist())
+    ids = ids_of(table, query)
+    with ProgressBar("rows", len(ids), None if out.isatty() else Console(stderr=True)) as bar:
+        for block in rows_of(split, ids, names):
+            writer.writerows([_cell(value) for value in row.values()] for row in block.to_pylist())
+            bar.advance(block.num_rows)
+            if not has_reader():
+                return
 
 
 def _cell(value: Any) -> Any:

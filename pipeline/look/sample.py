@@ -14,6 +14,7 @@ from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.read.levels import writing_to
 from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store.files import replacing
 
 LEVELS = 15  # default number of levels
 MAX_LEVELS = 100
@@ -34,8 +35,8 @@ def sample(job: JobConfig, out: Path) -> None:
         raise UserError(f"levels is {job.levels}: a sheet has room for at most {MAX_LEVELS}.")
     prepare_jax()
     page = sheet_of(job)
-    with writing_to(out):
-        write_png(page, out)
+    with writing_to(out), replacing(out) as unfinished:
+        write_png(page, unfinished)
     name, _ = name_and_hash(job.distribution)
     print(f"{out}: levels {ids[0]} to {ids[-1]} of size {job.size}, distribution {name or 'custom'}")
 

@@ -27,6 +27,7 @@ from levelproof.pipeline.read.levels import find_level, is_level_file, level_fil
 from levelproof.pipeline.read.rows import read_row
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.fields import tree_of
+from levelproof.pipeline.store.files import replacing
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 
 STEPS_A_PICTURE = 2  # env steps between the pictures of a film: 15 pictures/s
@@ -52,8 +53,8 @@ def show(source: Path, level_id: int | None, out: Path) -> None:
         raise UserError(f"Cannot draw to {out}: its name must end in {', '.join(WRITERS)}.")
     prepare_jax()
     film = film_of(source, level_id, plays=suffix != ".png")
-    with writing_to(out):
-        write(film, out)
+    with writing_to(out), replacing(out) as unfinished:
+        write(film, unfinished)
     print(f"{out}: {film.description}")
 
 
@@ -200,7 +201,7 @@ def write_mp4(film: Film, path: Path) -> None:
     raw = b"".join(picture.tobytes() for picture in [*pictures, *pictures[-1:] * (rest - 1)])
     done = subprocess.run([*command, str(path)], input=raw, capture_output=True, check=False)
     if done.returncode:
-        raise Failure(f"ffmpeg could not write {path}: {done.stderr.decode(errors='replace').strip()[-200:]}")
+        raise Failure(f"ffmpeg could not encode the film: {done.stderr.decode(errors='replace').strip()[-200:]}")
 
 
 def packaged_ffmpeg() -> str | None:

@@ -9,7 +9,7 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.store.job_note import NoteError, read_note
 from levelproof.pipeline.store.layout import JOB, QUARANTINE
 from levelproof.pipeline.store.locks import is_written
-from levelproof.pipeline.store.manifest import read_manifest
+from levelproof.pipeline.store.manifest import read_manifest, require_manifest
 from levelproof.pipeline.store.quarantine import given_up
 from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.runs import inside, runs_text
@@ -41,9 +41,11 @@ def read_status(split: Path, say: Callable[[str], None] = lambda _: None) -> dic
     """Collect the facts that `status` prints."""
     try:
         note = read_note(split)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
+        require_manifest(split, [])
         raise UserError(
-            f"There is no split at {split}: give a folder such as data/128k/s that `levelproof generate` made."
+            f"{as_typed(split)} has no {JOB}, which says what was requested: `levelproof inspect {as_typed(split)}` "
+            "shows what it has."
         ) from None
     except NoteError:
         raise UserError(f"The file {split / JOB} is damaged: run `levelproof generate` for this split again.") from None

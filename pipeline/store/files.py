@@ -2,7 +2,8 @@
 
 import os
 import shutil
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from levelproof.pipeline.store import objects
@@ -34,6 +35,25 @@ def write(path: Path, data: bytes, mode: int = 0o666, durable: bool = False) -> 
         raise
     if durable:
         flush_entry(path.parent)  # makes the file's name durable
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a new, empty file beside `path`, with its suffix, which replaces it when the block ends without an error.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    unfinished = path.with_name(f".{os.getpid()}.{path.name}")
+    try:
+        unfinished.unlink(missing_ok=True)  # perhaps a link to another file
+        unfinished.touch(exist_ok=False)
+        yield unfinished
+        unfinished.replace(path)
+    except BaseException:
+        with suppress(OSError):
+            unfinished.unlink(missing_ok=True)
+        raise
 
 
 def remove(path: Path) -> None:

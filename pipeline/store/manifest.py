@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from rich.console import Console
 
 from levelproof.configs.convert import flat
 from levelproof.configs.schema import is_grown
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.store import files
-from levelproof.pipeline.store.bar import with_bar
 from levelproof.pipeline.store.bounds import Bounded, with_dictionaries
 from levelproof.pipeline.store.checksums import digests_below, with_own
 from levelproof.pipeline.store.columns import COLUMNS, MANIFEST_VERSION, schema_of, with_current_names
@@ -30,6 +30,7 @@ from levelproof.pipeline.store.disk import flush, flush_entry, regular
 from levelproof.pipeline.store.formats import CONFIG_KEY, DENSITIES_KEY, DIGESTS_KEY, HASH_KEY, SEALED_KEY, VERSION_KEY
 from levelproof.pipeline.store.fragment import FULL, Fragment, read_fragment
 from levelproof.pipeline.store.layout import FRAGMENT, JOB, MANIFEST, Attempt, entries, ids_of
+from levelproof.pipeline.store.progress_bar import ProgressBar
 from levelproof.pipeline.store.remote import INDEX, is_remote
 from levelproof.pipeline.store.runs import ascending
 from levelproof.pipeline.store.seed.file import is_seed
@@ -195,7 +196,7 @@ class Manifest:
 
 def read_manifest(
     split: Path | str,
-    columns: Sequence[str] | None = None,
+    columns: Sequence[str] | str | None = None,
     level_ids: Sequence[int] | np.ndarray | None = None,
     *,
     compact: bool = False,
@@ -205,7 +206,7 @@ def read_manifest(
 
     Args:
         split: the folder `{out}/{budget}/{size}`, or a seed file, or a folder of seed files.
-        columns: columns to read (default: all); `level_id` is always included.
+        columns: columns to read, or one (default: all); `level_id` is always included.
         level_ids: levels to read (default: all); fragments whose name excludes all of them are not opened.
         compact: return repetitive columns as dictionaries, which for millions of rows take a tenth of the memory.
         each: reduces each fragment's rows, in threads; must keep `level_id`.
@@ -214,7 +215,7 @@ def read_manifest(
         UserError: there is no such column.
         Failure: a fragment is damaged, or fragments have different configurations.
     """
-    split = Path(split)
+    split, columns = Path(split), [columns] if isinstance(columns, str) else columns
     names = COLUMNS.names if columns is None else list(dict.fromkeys(["level_id", *map(with_current_names, columns)]))
     if unknown := [name for name in names if name not in COLUMNS.names]:
         raise UserError(f"There is no column {unknown[0]!r}: the manifest has {', '.join(COLUMNS.names)}.")
@@ -257,7 +258,11 @@ def _parts(
         for listing in range(MAX_LISTINGS):
             listed = entries(split, MANIFEST, FRAGMENT, DirEntry.is_file).items()
             new = [entry for entry in listed if entry not in parts_read and _wanted(entry[0], level_ids)]
-            parts = list(with_bar(threads.map(read, (path for path, _ in new)), "fragments", len(new), MANY))
+            with ProgressBar("fragments", len(new), Console(stderr=True) if len(new) >= MANY else None) as bar:
+                parts = []
+                for part in threads.map(read, (path for path, _ in new)):
+                    parts.append(part)
+                    bar.advance(1)
             parts_read |= {entry: part for entry, part in zip(new, parts, strict=True) if part}
             if listing and all(part and not part[0].sealed for part in parts):
                 latest = {path: part for (path, _), part in parts_read.items()}  # a path's file may have been replaced

@@ -5,9 +5,9 @@ from pathlib import Path
 from rich.console import Console
 
 from levelproof.levelgen.sampling.sampler import CHUNK
-from levelproof.pipeline.read.progress_bar import ProgressBar
 from levelproof.pipeline.store.checksums import has_own
 from levelproof.pipeline.store.manifest import read_manifest
+from levelproof.pipeline.store.progress_bar import ProgressBar
 from levelproof.pipeline.store.seed.columns import ROW_GROUP
 from levelproof.pipeline.store.seed.file import STORED, read_seed, seed_files
 from levelproof.pipeline.store.seed.shard import SeedShard

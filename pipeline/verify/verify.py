@@ -29,7 +29,6 @@ from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.errors import Exit, Failure
 from levelproof.pipeline.read.level_files import level_at
 from levelproof.pipeline.read.levels import recorded_settings
-from levelproof.pipeline.read.progress_bar import ProgressBar
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.bounds import DAMAGE, MAX_ROWS, DataUnread, bounded, unread
 from levelproof.pipeline.store.checksums import digests_of, has_own
@@ -59,6 +58,7 @@ from levelproof.pipeline.store.manifest import (
 )
 from levelproof.pipeline.store.named import open_shard
 from levelproof.pipeline.store.origins import RECORD, origin_of
+from levelproof.pipeline.store.progress_bar import ProgressBar
 from levelproof.pipeline.store.remote import is_remote
 from levelproof.pipeline.store.runs import runs, runs_text, without
 from levelproof.pipeline.store.seed.file import is_seed

@@ -34,7 +34,7 @@ def split(tmp_path: Path) -> Path:
     return made_split(tmp_path, [[Label.SOLVED, Label.UNSOLVED]])
 
 
-def levelproof(*arguments: str, **streams: Any) -> subprocess.CompletedProcess[str]:
+def levelproof(*arguments: str | bytes, **streams: Any) -> subprocess.CompletedProcess[str]:
     """Run the command unbuffered: each print is a write, as for a report larger than the buffer."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
     command = [sys.executable, "-m", "levelproof", *arguments]
@@ -63,6 +63,23 @@ def test_closed_stdout_is_not_an_error(split: Path) -> None:
         ["bash", "-c", command], env=environment, capture_output=True, text=True, check=False, timeout=patience(1800)
     )
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("output", ["--json", "--csv"])
+def test_results_for_a_closed_stdout_are_not_an_error(split: Path, output: str) -> None:
+    command = f"{sys.executable} -m levelproof inspect {split} {output} >&- 2>&-"
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(["bash", "-c", command], env=environment, check=False, timeout=patience(1800))
+    assert done.returncode == 0
+
+
+def test_paths_that_are_not_utf_8_are_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONIOENCODING", "utf-8:strict")  # as in most locales, but not in C
+    out = tmp_path / "caf\udce9.png"  # a byte that is not UTF-8
+    done = levelproof("sample", "size=s", "levels=1", "-o", os.fsencode(out))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "caf\\udce9.png: level" in done.stdout
+    assert out.exists()
 
 
 def test_full_disk_below_stdout_is_an_error(split: Path) -> None:

@@ -22,10 +22,10 @@ from levelproof.pipeline.read.levels import rules_of
 from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.read.select import SOLVED, select_witnessed
 from levelproof.pipeline.runtime import prepare_jax
-from levelproof.pipeline.store.bar import with_bar
 from levelproof.pipeline.store.created import new_folder
 from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.manifest import require_manifest
+from levelproof.pipeline.store.progress_bar import shown_blocks
 from levelproof.pipeline.version import __version__
 from levelproof.pipeline.words import many
 
@@ -79,7 +79,7 @@ def export_minari(split: Path, where: str | None, out: Path, kind: ActionKind = 
 
 
 def _episodes(split: Path, rows: pa.Table, rules: TaskParams, kind: ActionKind) -> Iterator[Episode]:
-    for first in with_bar(range(0, rows.num_rows, READ_ROWS), "records"):
+    for first in shown_blocks(rows.num_rows, READ_ROWS, "records"):
         block = rows.slice(first, READ_ROWS)
         fields = read_rows(split, block)
         level, record = tree_of(Level, fields, "level/"), tree_of(Record, fields, "record/")

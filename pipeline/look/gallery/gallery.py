@@ -33,14 +33,14 @@ from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.read.select import columns_in, select
 from levelproof.pipeline.runtime import prepare_jax
-from levelproof.pipeline.store.bar import with_bar
 from levelproof.pipeline.store.created import new_folder
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
+from levelproof.pipeline.store.progress_bar import shown_blocks
 from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.words import many
 
 SITE = Path(__file__).parent / "site"
-ABOUT = Path("data") / "about.js"  # a folder with this file is a gallery
+ABOUT, PALETTE = Path("data") / "about.js", "palette.css"
 BLOCK = 64  # levels per file of worlds, and records in memory at a time
 FOLDER = 1000  # levels per folder of level files
 DIGITS = 6  # significant digits of fractions in a level's file
@@ -59,18 +59,18 @@ def gallery(split: Path, out: Path, where: str | None, most: int, policy: Path |
         policy: folder of a policy that plays beside the witnesses; None: none.
 
     Raises:
-        UserError: no split, no matching level, no usable policy, `out` exists and is not a gallery, or it cannot be
-            written.
+        UserError: no split, no matching level, no usable policy, `out` exists and is not a gallery alone, or it cannot
+            be written.
         Failure: the split is damaged.
     """
     prepare_jax()
     manifest, matching = _chosen(split, where, most)
     count = manifest.table.num_rows
     contender = _contender(policy, manifest) if policy else None
-    with new_folder(out, replaces=lambda folder: (folder / ABOUT).is_file()) as folder:
+    with new_folder(out, replaces=_is_gallery) as folder:
         shutil.copytree(SITE, folder, dirs_exist_ok=True)
-        (folder / "palette.css").write_text(palette_css(), encoding="utf-8")
-        blocks = with_bar(range(0, count, BLOCK), "levels")
+        (folder / PALETTE).write_text(palette_css(), encoding="utf-8")
+        blocks = shown_blocks(count, BLOCK, "levels")
         written = [_write_block(folder, manifest, first, contender) for first in blocks]
         entities = {name: np.concatenate([counts[name] for counts, _ in written]) for name in ENTITIES}
         numbers = entities | {"seconds": cost.seconds_of(manifest.table)}
@@ -84,6 +84,12 @@ def gallery(split: Path, out: Path, where: str | None, most: int, policy: Path |
     some = many(count, "level") if count == matching else sample
     print(f"{out / 'index.html'}: {some} of {as_typed(split)}, {size / 1e6:,.1f} MB. Open it in a browser, or:")
     print(f"{Path(sys.executable).name} -m webbrowser {shlex.quote(str(out / 'index.html'))}")
+
+
+def _is_gallery(folder: Path) -> bool:
+    """Return whether a folder is a gallery, and nothing else: as the root of a website it may hold other files."""
+    ours = {"data", PALETTE, *(path.name for path in SITE.iterdir())}
+    return (folder / ABOUT).is_file() and {path.name for path in folder.iterdir()} <= ours
 
 
 def _chosen(split: Path, where: str | None, most: int) -> tuple[Manifest, int]:

@@ -20,6 +20,7 @@ from levelproof.levelgen.sampling.sampler import CHUNK
 from levelproof.pipeline.store.bounds import DAMAGE
 from levelproof.pipeline.store.columns import COLUMNS, REPETITIVE, schema_of
 from levelproof.pipeline.store.fragment import Fragment
+from levelproof.pipeline.store.progress_bar import shown_blocks
 from levelproof.pipeline.store.remote import absolute, as_typed
 from levelproof.pipeline.store.seed.columns import KEPT
 from levelproof.pipeline.store.seed.file import SeedFile, damaged_seed, read_seed, seed_files
@@ -37,6 +38,7 @@ MADE_FROM: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("versions", "engine", "device"), ("made_with",)),
 }
 # Left out of seed files: 0 when read
+MANY = 20_000  # levels that take a while to hash
 COSTS = ("env_steps", "evaluation_steps", "scout_steps", "search_steps", "episodes")
 Each = Callable[[pa.Table], pa.Table]
 
@@ -181,10 +183,10 @@ def _commands(about: SeedFile, rows: pa.Table) -> pa.Array:
 
 
 def _identities(about: SeedFile, rows: pa.Table) -> dict[str, pa.Array]:
-    """Hash the levels of rows, which takes about a tenth of a millisecond for each."""
+    """Hash the levels of rows, which takes about a tenth of a millisecond for each; many show progress."""
     source = LevelSource.of(about.fragment.config, about.fragment.path)
     identities: dict[str, list[Any]] = {name: [] for name in IDENTITIES}
-    for first in range(0, rows.num_rows, CHUNK):
+    for first in shown_blocks(rows.num_rows, CHUNK, "levels hashed", least=MANY):
         some = rows.slice(first, CHUNK)
         levels = source.levels(some.column("level_id").to_numpy(), some.column("content").to_pylist())
         identities["content_hash"] += content_hashes(levels)

@@ -117,6 +117,8 @@ def test_invalid_command_prints_the_usage(capsys: pytest.CaptureFixture[str], ar
         (["inspect", "x", "--were", "a"], "There is no option --were: --help lists the options"),
         (["--debug", "generate"], "--debug comes after the command, as in levelproof generate --debug"),
         (["show", "x", "-o", "y.svg", "z"], "There is no argument z: --help lists them"),
+        (["show", "x", "-o", "y.svg", "9" * 5000], "There is no argument 9999"),
+        (["inspect", "x" * 300], f"Cannot use {'x' * 200}... (File name too long): check the path"),
         (["sample", "level_files=x"], "sample draws random levels"),
         (["verify", "--repair"], "There is no split to verify"),
         (["verify", "--repair", "executor=inline", "x"], "There is no split at x"),
@@ -145,6 +147,8 @@ def test_arguments_may_follow_options(split: Path) -> None:
     """argparse leaves over those that are optional."""
     done = here(["export", "data/5k/s", "-o", "level.json", str(solved_level(split))], split.parents[2])
     assert done.returncode == 0, done.stderr
+    done = here(["export", "data/5k/s", str(solved_level(split))], split.parents[2])
+    assert_refused(done, 2, "level.json already exists: name the file to write with -o, as in -o level-")
     done = here(["card", "data/5k/s", "--license", "mit", "data/5k/s"], split.parents[2])
     assert "There is no argument" not in done.stderr
     done = here(["plan", "size=s", "--json", "levels=six"], split.parents[2])

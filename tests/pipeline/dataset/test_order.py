@@ -75,6 +75,14 @@ def test_items_of_several_batches_are_those_of_each() -> None:
     assert new.tolist() == np.concatenate([one for _, one in each]).tolist()
 
 
+def test_integers_of_numpy_are_those_of_python() -> None:
+    """Positions are saved as JSON."""
+    names = ("batch_size", "seed", "process_index", "process_count")
+    given = dict(zip(names, np.array([2, 7, 0, 2]), strict=True))
+    assert EpochOrder(10, **given) == EpochOrder(10, 2, 7, 0, 2)
+    assert all(type(getattr(EpochOrder(10, **given), name)) is int for name in names)
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
@@ -82,6 +90,8 @@ def test_items_of_several_batches_are_those_of_each() -> None:
         ({"batch_size": 2.5}, r"A batch cannot have 2\.5 items"),
         ({"process_index": 2, "process_count": 2}, "There is no process 2 of 2"),
         ({"seed": -1}, "The seed is -1"),
+        ({"seed": 1.5}, r"The seed is 1\.5"),
+        ({"process_count": 2.0}, r"There is no process 0 of 2\.0"),
     ],
 )
 def test_epoch_order_rejects_invalid_arguments(arguments: dict, sentence: str) -> None:

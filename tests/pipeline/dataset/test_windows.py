@@ -30,3 +30,7 @@ def test_windows_cover_a_record_without_overlap(length: int | None, per_record: 
 def test_windows_reject_an_invalid_length(length) -> None:
     with pytest.raises(UserError, match=f"A window cannot have {length} steps"):
         Windows.of(length)
+
+
+def test_window_length_may_be_of_numpy() -> None:
+    assert type(Windows.of(np.int64(32)).length) is int  # pyright: ignore[reportArgumentType]

@@ -1,10 +1,12 @@
 """Parquet exports: rows, worlds, and omitted levels."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import duckdb
 import jax
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 import levelproof
@@ -67,3 +69,17 @@ def test_export_parquet_omits_levels_that_differ_here(split: Path, tmp_path: Pat
     assert main(["export", str(split), "--format", "parquet", "-o", str(tmp_path / "levels")]) == 0
     assert f"{PLAYED - 1} levels, without 1 that differ on this machine" in capsys.readouterr().out
     assert first["level_id"] not in pq.read_table(tmp_path / "levels")["level_id"].to_pylist()
+
+
+def test_row_groups_are_written_as_they_come(tmp_path: Path) -> None:
+    """So that memory holds one of them, and progress is that of the file."""
+    out, sizes = tmp_path / "rows.parquet", []
+
+    def groups() -> Iterator[pa.Table]:
+        for seed in range(4):
+            sizes.append(out.stat().st_size if out.exists() else 0)
+            yield pa.table({"x": np.random.default_rng(seed).random(10_000)})
+
+    assert parquet._write(out, groups(), {}) == 40_000
+    assert sizes[0] == 0
+    assert (np.diff(sizes[1:]) > 50_000).all(), sizes

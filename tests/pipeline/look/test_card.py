@@ -2,6 +2,7 @@
 
 import io
 import re
+import shutil
 from pathlib import Path
 from shutil import copyfile
 from typing import Any
@@ -15,6 +16,7 @@ from PIL import Image
 from levelproof.experts.labels import Label
 from levelproof.pipeline.cli.main import main
 from levelproof.pipeline.dataset.sample import SAMPLE
+from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look import card as cards
 from levelproof.pipeline.look.figures import Share
 from levelproof.pipeline.look.preview import PICTURES, PIXELS, SHOWN
@@ -130,6 +132,22 @@ def test_card_overwrites_only_cards(dataset: Path, tmp_path: Path, capsys, monke
     assert "is not below" in below
     assert "There is no split at" in nothing
     assert not list(tmp_path.iterdir())
+
+
+def test_card_counts_each_split_once_and_refuses_equal_subsets(dataset: Path, monkeypatch) -> None:
+    monkeypatch.setattr(cards, "SAMPLE", 2)
+    split, out = dataset / "64k/s", dataset / "TWICE.md"
+    cards.card([split], out, CardOptions())
+    once = out.read_text()
+    cards.card([split, split], out, CardOptions())
+    assert out.read_text() == once
+    shutil.copytree(split, dataset / "64k.s")
+    try:
+        with pytest.raises(UserError, match=r"Both 64k/s and 64k\.s would be the subset 64k-s: rename one of them"):
+            cards.card([split, dataset / "64k.s"], out, CardOptions())
+    finally:
+        shutil.rmtree(dataset / "64k.s")
+    assert out.read_text() == once
 
 
 @pytest.mark.parametrize(("witnesses", "words"), [(0, "n<1K"), (3, "n<1K"), (4, "1K<n<10K"), (6 * 10**6, "1B<n<10B")])

@@ -213,10 +213,14 @@ def test_gallery_replaces_only_galleries(split: Path, tmp_path: Path, monkeypatc
     (out / "notes.txt").unlink()
     out.rmdir()
     gallery(split, out, None, 1)
-    (out / "old").write_text("")
+    (out / "CNAME").write_text("mine")  # the root of a website
+    with pytest.raises(UserError, match=r"/.* already exists"):
+        gallery(split, out, None, 2)
+    assert (out / "CNAME").read_text() == "mine"
+    (out / "CNAME").rename(out / "data/old")
     gallery(split, out, None, 2)
     assert data(out, "about")["levels"] == 2
-    assert not (out / "old").exists()
+    assert not (out / "data/old").exists()
 
     def fail(_: object) -> str:
         raise Failure("the shard is damaged")

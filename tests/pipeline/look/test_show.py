@@ -149,6 +149,20 @@ def test_show_writes_mp4(split, tmp_path) -> None:
     assert (tmp_path / "level.mp4").read_bytes()[4:8] == b"ftyp"
 
 
+def test_show_keeps_the_earlier_film_if_a_new_one_fails(split, tmp_path, monkeypatch) -> None:
+    show(split, level_with(split, "solved"), tmp_path / "level.mp4")
+    earlier = (tmp_path / "level.mp4").read_bytes()
+    broken = tmp_path / "bin/ffmpeg"
+    broken.parent.mkdir()
+    broken.write_text('#!/bin/sh\nfor out; do :; done\nprintf half > "$out"\nexit 1\n')
+    broken.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{broken.parent}:/usr/bin:/bin")
+    with pytest.raises(Failure, match="ffmpeg could not encode the film"):
+        show(split, level_with(split, "solved"), tmp_path / "level.mp4")
+    assert (tmp_path / "level.mp4").read_bytes() == earlier
+    assert {path.name for path in tmp_path.iterdir()} == {"bin", "level.mp4"}
+
+
 def test_show_mp4_needs_ffmpeg(split, tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)

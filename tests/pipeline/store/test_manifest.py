@@ -14,7 +14,6 @@ from levelproof.configs.schema import JobConfig
 from levelproof.experts.labels import Label
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs.unit import manifest_row
-from levelproof.pipeline.store import bar
 from levelproof.pipeline.store import manifest as manifest_file
 from levelproof.pipeline.store.columns import COLUMNS
 from levelproof.pipeline.store.layout import new_attempt, unit_name
@@ -71,7 +70,7 @@ def test_read_manifest_shows_a_bar_for_many_fragments(
 ) -> None:
     output = io.StringIO()
     monkeypatch.setattr(manifest_file, "MANY", 2)
-    monkeypatch.setattr(bar, "Console", lambda stderr: Console(file=output, force_terminal=terminal))
+    monkeypatch.setattr(manifest_file, "Console", lambda stderr: Console(file=output, force_terminal=terminal))
     commit(tmp_path, job, [0])
     assert read_manifest(tmp_path).level_ids.tolist() == [0]
     assert not output.getvalue()

@@ -5,8 +5,8 @@ import io
 import pytest
 from rich.console import Console
 
-from levelproof.pipeline.read import progress_bar
-from levelproof.pipeline.read.progress_bar import ProgressBar
+from levelproof.pipeline.store import progress_bar
+from levelproof.pipeline.store.progress_bar import ProgressBar
 
 
 def test_line_has_no_rate_before_one_is_known(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,7 @@
-"""Progress bar for long reads: on a terminal a bar, elsewhere a line every LINE_EVERY seconds."""
+"""Progress bar of long reads and writes: on a terminal a bar, elsewhere a line every LINE_EVERY seconds."""
 
 import time
+from collections.abc import Iterator
 from types import TracebackType
 
 from rich.console import Console
@@ -37,3 +38,20 @@ class ProgressBar:
             self._line_at = time.monotonic()
             left = f" · about {task.time_remaining:,.0f} s left" if task.time_remaining else ""
             self._console.print(text + left, highlight=False, markup=False, soft_wrap=True)
+
+
+def shown_blocks(count: int, size: int, what: str, console: Console | None = None, least: int = 0) -> Iterator[int]:
+    """Yield the first of every `size` of `count` items, and show how many are done.
+
+    Args:
+        count: number of items.
+        size: items per block.
+        what: what the items are, in the plural.
+        console: where to show it (default: standard error).
+        least: smallest count that is shown.
+    """
+    shown = (console or Console(stderr=True)) if count >= least else None
+    with ProgressBar(what, count, shown) as bar:
+        for first in range(0, count, size):
+            yield first
+            bar.advance(min(size, count - first))
