@@ -254,6 +254,11 @@ def compose_train(overrides: Sequence[str]) -> "TrainConfig":
             raise ConfigError(f"{name} has no effect without start: leave it out.")
         if name == "ppo.kl_updates" and not config.ppo.kl_weight:
             raise ConfigError(f"{name} has no effect without ppo.kl_weight: leave it out.")
+    if config.start and config.ppo.critic_updates >= config.ppo.updates:
+        raise ConfigError(
+            f"ppo.env_steps gives {config.ppo.updates} updates, and the first {config.ppo.critic_updates} "
+            "(ppo.critic_updates) leave the policy as it is: raise the one or lower the other."
+        )
     _require_no_network(config.start, parsed)
     _require_heads(config.network.kind, parsed)
     if random and config.distribution not in (known := distributions()):

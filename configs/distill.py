@@ -18,11 +18,11 @@ class DistillConfig:
 
     where: str = "label = 'solved'"  # SQL condition on the manifest's columns that selects levels
     start: str = ""  # folder of a policy to continue training, with its network; empty: from scratch
-    pool: int = 16_384  # levels in memory, drawn evenly if the split has more
+    pool: int = 16_384  # levels to learn from, drawn for the whole run if the split has more
     interval: int = 100  # updates between rounds in which teachers label states; each ends with a checkpoint
     episodes: int = 512  # episodes that the learner plays in a round, each in another level
     states: int = 256  # states of these episodes that teachers label in a round; 0: none
-    failed: float = 0.9  # share of labelled states from episodes that did not reach the goal
+    failed: float = 0.9  # share of the states asked about from episodes that did not reach the goal
     demonstrations: int = 0  # episodes of kept experts in a round, most with noise, at most one of each expert
     path: int = 16  # maximum env steps to learn from a teacher's path to the goal, evenly spaced; 1: only the first
     buffer: int = 65_536  # transitions of teachers in memory, the latest ones

@@ -151,7 +151,10 @@ def train(
     """
     last, first, recent = config.train.updates, int(state.updates), []
     before, pace = metrics.last.get("bc/core_seconds", 0.0), Pace()
-    feed = Feed(sources, config)
+    feed, total = Feed(sources, config), sum(len(source.train) for source in sources)
+    if feed.used < total:
+        text = f"Learns from {feed.used:,} of {total:,} levels: raise pool or train.updates, or lower refresh, for all."
+        say(console, text)
     with ProgressBar("levels read", feed.levels, console) as bar:
         batches = feed.batches(first, feed.read(first, bar.advance))
     with shown(console, "reading validation levels", last, first) as show:

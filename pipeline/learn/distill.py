@@ -28,6 +28,7 @@ from levelproof.pipeline.learn.curves import BLUE, GREEN, YELLOW, Curves, Panel
 from levelproof.pipeline.learn.folder import (
     continued,
     keep_run,
+    origin_of,
     require_finite,
     require_same_run,
     settings_without,
@@ -110,8 +111,7 @@ def distill(split: Path, config: DistillConfig, out: Path, console: Console) -> 
 
         def save(now: Distillation) -> None:
             require_ours()
-            origin = note | {"updates": int(now.imitation.updates)}
-            origin |= {"start_origin": dict(start.origin)} if start else {}
+            origin = origin_of(note, {"updates": int(now.imitation.updates)}, start)
             keep_run(out, Policy(network, now.imitation.average, network.only_size(size), origin), now)
 
         with Metrics(out, COURSE, config.log, note, int(now.imitation.updates), tell, require_ours) as metrics:
@@ -137,6 +137,7 @@ def levels_for(split: Path, config: DistillConfig, tell: Callable[[str], None]) 
         raise UserError(f"{split} has only trivial levels that meet the condition: choose others with where.")
     chosen = np.flatnonzero(usable & ~trivial)
     if len(chosen) > config.pool:
+        tell(f"Learns from {config.pool:,} of {len(chosen):,} levels of {split} (pool), drawn for the whole run.")
         chosen = np.sort(np.random.default_rng(config.seed).choice(chosen, config.pool, replace=False))
     facts = {
         "split": str(split),

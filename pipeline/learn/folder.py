@@ -170,6 +170,17 @@ def require_finite(loss: float, setting: str) -> None:
         )
 
 
+def origin_of(note: dict[str, Any], progress: dict[str, int], start: Policy | None = None) -> dict[str, Any]:
+    """Return a policy's origin: what decides its run, how far the run is, and the policy that it started from, if any.
+
+    That policy's network is kept, so settings of another one are left out.
+    """
+    if start is None:
+        return note | progress
+    settings = {name: value for name, value in note["settings"].items() if name != "network"}
+    return note | progress | {"settings": settings, "start_origin": dict(start.origin)}
+
+
 def keep_run(out: Path, policy: Policy, state: Any) -> None:
     """Write the checkpoint, then the policy, so that a stopped run never has a policy without a checkpoint.
 

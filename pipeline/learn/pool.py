@@ -126,6 +126,12 @@ class Feed:
         """Number of levels that `read` reads."""
         return sum(order.batch_size for order in self._orders)
 
+    @property
+    def used(self) -> int:
+        """Number of levels that some update draws from."""
+        turns = self._turn(self._config.train.updates - 1) + 1
+        return sum(min(turns * order.batch_size, order.count) for order in self._orders)
+
     def read(self, update: int, follow: Callable[[int], None] = lambda _: None) -> list[LevelPool]:
         """Read the pools that an update draws from, one for each split; call `follow` as `read_pool` does."""
         return self._read(self._turn(update), follow)

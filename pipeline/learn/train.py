@@ -28,6 +28,7 @@ from levelproof.pipeline.learn.folder import (
     continued,
     keep_run,
     note_in,
+    origin_of,
     require_finite,
     require_same_run,
     settings_without,
@@ -72,6 +73,7 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
     start = policy_at(Path(config.start)) if config.start else None
     if start:
         require_size(start, source.levels.size, source.name, "start from one that plays any size")
+        tell(f"{config.start} learns from {source.name}.")
     recipe = recipe_of(config, source, start, cores)
     note = note_of(config, source, cores)
     params = None if start is None else start.params
@@ -89,8 +91,7 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
         def save(learner: Learner) -> None:
             require_ours()
             fits = recipe.network.only_size(source.levels.size)
-            origin = note | {"env_steps": int(learner.updates) * config.ppo.steps_per_update}
-            origin |= {"start_origin": dict(start.origin)} if start else {}
+            origin = origin_of(note, {"env_steps": int(learner.updates) * config.ppo.steps_per_update}, start)
             keep_run(out, Policy(recipe.network, learner.average, fits, origin), learner)
 
         with Metrics(out, COURSE, config.log, note, steps, tell, require_ours) as metrics:
@@ -120,7 +121,11 @@ def prepared_cores(config: TrainConfig, note: dict[str, Any] | None) -> int:
 
 
 def recipe_of(config: TrainConfig, source: TrainingLevels, start: Policy | None, cores: int) -> TrainingRecipe:
-    """Return what decides the programs. Raise UserError if the cores do not divide the lanes evenly."""
+    """Return what decides the programs.
+
+    Raises:
+        UserError: the cores do not divide the lanes evenly, or measured episodes would have no time to fail.
+    """
     try:
         config.ppo.samples(cores)
     except ValueError as error:
@@ -134,6 +139,11 @@ def recipe_of(config: TrainConfig, source: TrainingLevels, start: Policy | None,
 def curriculum_of(config: TrainConfig, levels: Level | Sampler, rules: TaskParams) -> Curriculum:
     """Return the curriculum that the settings name."""
     if config.chosen_by == "learnability":
+        if config.curriculum.measured_steps < rules.max_timesteps:
+            raise UserError(
+                f"curriculum.measured_steps is {config.curriculum.measured_steps}, but episodes have up to "
+                f"{rules.max_timesteps} env steps: those that fail late would not count, so raise it to that."
+            )
         return learnability(config.curriculum)
     if config.chosen_by == "replay":
         return replay(config.replay)

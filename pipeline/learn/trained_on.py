@@ -95,4 +95,9 @@ def _random(config: TrainConfig) -> TrainingLevels:
     except ValueError as error:
         raise UserError(f"Cannot sample levels: {error}.") from None
     name = f"random {config.size}"
-    return TrainingLevels(name, levels, DEFAULT_RULES, {"levels": name, "distribution": config.distribution})
+    return TrainingLevels(
+        f"random levels of size {config.size}",
+        levels,
+        DEFAULT_RULES,
+        {"levels": name, "distribution": config.distribution},
+    )

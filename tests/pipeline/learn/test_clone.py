@@ -190,6 +190,16 @@ def test_levels_are_read_equally_often_if_memory_holds_two_thirds_of_them(split:
     assert sorted(items.tolist()) == list(range(count)), "each once in an epoch of two rounds"
 
 
+@pytest.mark.parametrize(("updates", "share"), [(1, 0.5), (10, 0.5), (11, 1), (100, 1)])
+def test_levels_that_no_update_draws_from_are_counted(split: Path, updates: int, share: float) -> None:
+    config = replace(CloneConfig(), where="", validation=0.3, refresh=10, train=ImitationConfig(updates=updates))
+    source = module.source_of(split, config, lambda _: None)
+    count = len(source.train) // 2 * 2
+    source = source._replace(train=source.train[:count])
+    assert Feed([source], replace(config, pool=count // 2)).used == share * count
+    assert Feed([source], config).used == count, "all are in memory"
+
+
 def test_bad_input_is_refused(split: Path, policy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert_refused(here(["clone", "train.updates=3"], tmp_path), 2, "no split to clone")
     assert_refused(here(["clone", str(split), "train.update=3"], tmp_path), 2, "did you mean train.updates?")

@@ -181,6 +181,7 @@ def test_start_keeps_its_weights_while_the_critic_fits(
     curve = metrics(trained(tmp_path, 5, *words))
     origin = levelproof.load_policy(tmp_path / "agent").origin
     assert origin["start_origin"] == levelproof.load_policy(agent).origin
+    assert "network" not in origin["settings"], "the start gives it"
     before = load_file(agent / "policy.safetensors")
     same = [all((weights[name] == before[name]).all() for name in before) for weights in kept[:5]]
     assert same == [True, True, False, False, False]
@@ -268,6 +269,14 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (["levels=evolve", "replay.capacity=4"], "evolve.children is 64: it must not exceed 2"),
         (["ppo.kl_weight=1"], "no effect without start"),
         (["start=policy", "ppo.kl_updates=8"], "ppo.kl_updates has no effect without ppo.kl_weight"),
+        (
+            ["start=policy", "ppo.env_steps=4M"],
+            "ppo.env_steps gives 8 updates, and the first 10 (ppo.critic_updates) leave the policy as it is",
+        ),
+        (
+            ["levels=learnability", "curriculum.measured_steps=255"],
+            "curriculum.measured_steps is 255, but episodes have up to 256 env steps",
+        ),
         (["start=policy", "network.width=8"], "network.width cannot change the network of the policy in start"),
         (["distribution=kinetx"], "did you mean kinetix?"),
         (["size=q"], "Cannot sample levels"),
