@@ -54,7 +54,7 @@ def _mirror_model(
 
     speed = np.asarray(model.motor_speed)
     thruster = np.asarray(model.thruster_rotation)
-    of_bodies = ("friction", "restitution", "collision_mode")
+    of_bodies = ("active", "friction", "restitution", "collision_mode")
     return replace(
         model,
         **{name: np.asarray(getattr(model, name))[order] for name in of_bodies},

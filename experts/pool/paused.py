@@ -1,4 +1,4 @@
-"""A paused expert, which can resume in another slot, process or machine, to the same bits."""
+"""A paused expert, which can resume in another slot, process or machine of the same kind, to the same bits."""
 
 from typing import NamedTuple
 

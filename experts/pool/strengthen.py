@@ -15,7 +15,7 @@ from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.search.edit import Draws, draw, edits, variation
 from levelproof.experts.search.play import arena, best_lane, code_of, decode, fresh_walk, success_of
 from levelproof.experts.search.shorten import Shortened, replayed
-from levelproof.experts.verdict.portability import moved, survivors
+from levelproof.experts.verdict.portability import LATE, moved, survivors
 from levelproof.experts.witness.success import Success
 from levelproof.levelgen.batching import repeat
 from levelproof.levelgen.level import Level
@@ -75,7 +75,8 @@ def strengthen(
         most = survived.max(-1)
         take = active & (most >= 0)
         code, length = best_lane(take, jnp.argmax(survived, axis=-1), (new, steps), (now.code, now.length))
-        env_steps = now.env_steps + jnp.where(active, (LANES + KEPT * STARTS) * now.length, 0)
+        longest = jnp.minimum(now.length + LATE, RECORD_STEPS)
+        env_steps = now.env_steps + jnp.where(active, LANES * now.length + KEPT * STARTS * longest, 0)
         return Strengthening(code, length, now.robust | (take & (most == STARTS)), env_steps, now.number + 1)
 
     none = jnp.zeros(count, jnp.int32)

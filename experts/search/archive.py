@@ -130,7 +130,8 @@ def widen(archive: Archive, full: Bool[Array, " level"], config: SearchConfig) -
 
     def wider(archive: Archive) -> tuple:
         width = jnp.where(full, archive.width * config.growth, archive.width)
-        key = keys_of(archive.entry.feature, width)
+        wide = keys_of(archive.entry.feature, width)
+        key = jnp.where(full[:, None], wide, archive.key)  # hashed once: another program may round features otherwise
         return archive.used & ~jax.vmap(beaten)(key, archive.entry.steps, archive.used), key, width
 
     small = lambda archive: (archive.used, archive.key, archive.width)

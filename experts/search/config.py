@@ -12,6 +12,7 @@ from levelproof.physics.bounds import require
 MAX_ROUNDS = 1024  # limit of `trials` and `robustness`
 MAX_RUNGS = 16  # each rung is four times the one before, and env steps are counted in 32 bits
 NEAREST = 8  # trajectories of a level that are varied; the first ones come from its archive
+LEAST_ROUND = 5  # env steps; `search.edit.Draws` has the random streams below
 MAX_ENTRIES = 16_384  # sums of their weights (`experts.search.archive`) must fit 32 bits
 
 
@@ -80,6 +81,11 @@ class SearchConfig:
         if self.lanes % len(self.resample):
             raise ValueError(
                 f"lanes is {self.lanes}: give a multiple of {len(self.resample)}, the probabilities in resample"
+            )
+        if self.steps_per_round < LEAST_ROUND:
+            raise ValueError(
+                f"lanes is {self.lanes}: a round of lanes x segments x segment env steps has fewer than {LEAST_ROUND}: "
+                "raise one of them"
             )
         if self.steps_per_round > MAX_COUNTED // 4:
             raise ValueError(

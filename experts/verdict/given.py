@@ -1,5 +1,7 @@
 """Imported actions: replay them in this engine, and label their levels by the result."""
 
+import warnings
+
 import jax
 import numpy as np
 from jaxtyping import Int
@@ -24,12 +26,19 @@ def label_given(
 
     If the first episode reaches the goal but a later one does not, the first episode, repeated, is the witness.
     Levels that need no expert are judged as always: the witness of a trivial one does nothing.
+    A replayed witness overrules a proof that there is none, with a warning, because the proof must be wrong.
     """
     before, failed = decide(levels, rules)
     record = replay(levels, action, rules)
     whole, done, steps = succeeds(record.done, record.goal), np.asarray(record.done), steps_to_goal(record.done)
     at_first = np.take_along_axis(np.asarray(record.goal), steps[None] - 1, 0)[0]
     ends = done[steps - 1, np.arange(len(steps))]  # whether any episode ends
+    for i, verdict in enumerate(before):
+        if verdict is not None and verdict.label == Label.UNSOLVABLE and (whole[i] or at_first[i]):
+            warnings.warn(
+                f"Imported actions solve a level that is proved unsolvable: {verdict.label_reason}", stacklevel=2
+            )
+            before[i] = None
     new = action.copy()
     for i, verdict in enumerate(before):
         if verdict is not None:

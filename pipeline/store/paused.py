@@ -42,7 +42,7 @@ from levelproof.pipeline.store.layout import (
     ids_of,
 )
 from levelproof.pipeline.store.leases import require_served
-from levelproof.pipeline.store.provenance import versions
+from levelproof.pipeline.store.provenance import device, versions
 from levelproof.pipeline.store.remote import as_typed, at_once, is_remote
 
 MAGIC = b"levelproof checkpoint "  # start of a head
@@ -64,7 +64,7 @@ class _Head(NamedTuple):
     """The first line of a checkpoint."""
 
     level_ids: tuple[int, ...]
-    stamp: str  # configuration and versions; with others, results would differ
+    stamp: str  # configuration, versions and device; with others, results would differ
     start: int  # of the archive, in bytes
     sha256: str  # of the archive
 
@@ -181,11 +181,11 @@ def _arrays(paused: Paused) -> Any:
 
 
 def _stamp(job: JobConfig) -> str:
-    return json.dumps([job.hash, versions()], sort_keys=True)
+    return json.dumps([job.hash, versions(), device()], sort_keys=True)
 
 
 def _load(path: Path, wanted: set[int], job: JobConfig) -> dict[int, Paused]:
-    """Load the `wanted` experts of a checkpoint; none if it is damaged, or has another job or version."""
+    """Load the `wanted` experts of a checkpoint; none if it is damaged, or has another job, version or device."""
     try:
         head = _head(path)
         if head.stamp != _stamp(job) or wanted.isdisjoint(head.level_ids):

@@ -20,7 +20,7 @@ from levelproof.experts.labels import TRAINED, WITNESSED, Label
 from levelproof.experts.verdict.before import decide
 from levelproof.experts.witness.witness import Record, replay, steps_to_goal, succeeds
 from levelproof.levelgen.batching import LANES
-from levelproof.levelgen.identity.content import content_hashes, level_id_for
+from levelproof.levelgen.identity.content import VERSION, content_hashes, level_id_for
 from levelproof.levelgen.identity.keys import SAMPLER_VERSION
 from levelproof.levelgen.identity.signature import signatures
 from levelproof.levelgen.level import Level, size_of
@@ -48,6 +48,7 @@ COLUMNS = (
     "versions", "engine", "device",
 )  # fmt: skip
 
+PREFIX = f"c{VERSION}:"  # of content hashes as they are computed today
 Mask = Bool[np.ndarray, " level"]
 Lanes = Int[np.ndarray, " lane"]  # indices of some of the levels
 
@@ -80,7 +81,8 @@ class Evidence:
             name: rows.column(name).to_pylist() for name in COLUMNS if name != "versions"
         }
         self._positions = rows.select(POSITION_COLUMNS)
-        self.portable, self.same_stack = portable(rows), same_stack(rows)
+        self.portable = portable(rows)
+        self.same_release = self.portable & _made_with(rows, "levelproof", versions()["levelproof"])
         self.reported = np.zeros(len(self.ids), bool)
 
     def examine(self) -> None:
@@ -163,15 +165,19 @@ class Evidence:
     def _check_identities(self, levels: Level) -> Mask:
         """Check that rows describe the levels that their ids make; return which ones match in every bit.
 
-        A row made by another sampler or engine, or not on a CPU, needs only a matching signature.
+        A row made by another sampler or engine, or not on a CPU, needs only a matching signature; but a world that is
+        stored, not made from its id, has the same content hash everywhere.
         """
         rows = list(zip(self.columns["content_hash"], self.columns["signature"], strict=True))
         ours = list(zip(content_hashes(levels), signatures(levels), strict=True))
         same = np.array([a == b for a, b in zip(rows, ours, strict=True)])
+        near = np.array([bool(set(a[1]) & set(b[1])) for a, b in zip(rows, ours, strict=True)])
         if self.recipe.distribution is None:
             own = [level_id_for(content) == level_id for (content, _), level_id in zip(ours, self.ids, strict=True)]
-            same &= np.array(own) | [RECORD.fullmatch(file or "") is not None for file in self.columns["file"]]
-        near = np.array([bool(set(a[1]) & set(b[1])) for a, b in zip(rows, ours, strict=True)])
+            own = np.array(own) | [RECORD.fullmatch(file or "") is not None for file in self.columns["file"]]
+            other = np.array([a.startswith(PREFIX) and a != b for (a, _), (b, _) in zip(rows, ours, strict=True)])
+            same &= own
+            near &= (own & ~other) | [shard is None for shard in self.columns["shard"]]
         self._report(
             ~np.where(self.portable, same, near),
             lambda _: (
@@ -272,19 +278,24 @@ class Evidence:
             ours[name][..., lanes] = values
 
     def _check_labels(self, levels: Level, known: Mask) -> None:
-        """Check labels that need no expert, for levels whose every bit is `known`."""
+        """Check labels that need no expert, for levels whose every bit is `known`.
+
+        Of rows of other engines or GPUs only who may be unsolvable: doing nothing may end otherwise there.
+        """
         verdicts, failed = decide(levels, self.recipe.rules)
         labels, reasons = self.columns["label"], self.columns["label_reason"]
         rows = list(zip(verdicts, labels, reasons, strict=True))
         wrong = np.array([label != v.label if v else label not in TRAINED for v, label, _ in rows])
+        proved = np.array([v is not None and v.label == Label.UNSOLVABLE for v in verdicts])
+        proof_differs = proved != (np.array(labels, object) == Label.UNSOLVABLE)
         self._report(
-            known & wrong,
+            known & wrong & (self.portable | proof_differs),
             lambda i: f"is {labels[i]}, but {f'should be {v.label}' if (v := verdicts[i]) else 'nothing proves that'}",
         )
         unlike = np.array([v is not None and reason != v.label_reason for v, _, reason in rows])
-        self._report(known & unlike & self.same_stack, lambda i: f"is {labels[i]}, but not for the reason in its row")
+        self._report(known & unlike & self.same_release, lambda i: f"is {labels[i]}, but not for the reason in its row")
         self._report(
-            known & (failed != np.array(self.columns["failed_by_noop"])),
+            known & self.portable & (failed != np.array(self.columns["failed_by_noop"])),
             lambda i: f"{'fails' if failed[i] else 'does not fail'} by doing nothing, but the manifest says otherwise",
         )
 
@@ -295,17 +306,19 @@ def portable(rows: pa.Table) -> Mask:
     They are those that this sampler and engine made on a CPU, if this machine also computes on one, of any kind; and
     those of the same stack.
     """
-    made_with = rows.column("versions").combine_chunks()
-    sampler = made_with.field("sampler").to_numpy(zero_copy_only=False) == SAMPLER_VERSION
+    sampler = _made_with(rows, "sampler", SAMPLER_VERSION)
     on_cpu = np.array([name.startswith("cpu:") for name in rows.column("device").to_pylist()], bool)
     return same_stack(rows) | (sampler & _same_engine(rows) & on_cpu & device().startswith("cpu:"))
 
 
 def same_stack(rows: pa.Table) -> Mask:
     """Return which rows were made with the same versions and device as here, so that training repeats bit for bit."""
-    made_with = rows.column("versions").combine_chunks()
-    same = [made_with.field(name).to_numpy(zero_copy_only=False) == value for name, value in versions().items()]
+    same = [_made_with(rows, name, value) for name, value in versions().items()]
     return np.logical_and.reduce([*same, _same_engine(rows), rows.column("device").to_numpy() == device()])
+
+
+def _made_with(rows: pa.Table, name: str, version: Any) -> Mask:
+    return rows.column("versions").combine_chunks().field(name).to_numpy(zero_copy_only=False) == version
 
 
 def _same_engine(rows: pa.Table) -> Mask:

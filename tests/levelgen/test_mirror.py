@@ -49,6 +49,11 @@ def test_what_is_attached_to_a_wall_changes_walls() -> None:
     assert off.max() < 1e-5
     assert (image.model.joint_a[levels.model.joint_a == 1] == 2).all()
     assert (image.model.collides[1] == levels.model.collides[2][[0, 2, 1, *range(3, levels.size.bodies)]]).all()
+    one_wall = np.array(levels.model.active)
+    one_wall[1] = False
+    without = mirror(replace(levels, model=replace(levels.model, active=one_wall)))
+    assert not without.model.active[2].any()
+    assert without.model.active[1].all()
     impulses = np.random.default_rng(0).normal(size=levels.state.joint_impulse.shape).astype(np.float32)
     moving = replace(levels, state=replace(levels.state, joint_impulse=impulses, joint_angular_impulse=impulses[:, 0]))
     state = mirror(moving).state

@@ -13,7 +13,8 @@ from levelproof.experts.config import ExpertConfig, Rule, StopConfig
 from levelproof.experts.labels import Label, Source
 from levelproof.experts.pool.strengthen import cycled, strengthen
 from levelproof.experts.procedure import Procedure
-from levelproof.experts.search.config import SearchConfig
+from levelproof.experts.search.config import LEAST_ROUND, SearchConfig
+from levelproof.experts.search.edit import Draws
 from levelproof.experts.search.explore import NEARER, Search, begin, draw, explore, explore_rounds, under_way
 from levelproof.experts.search.near import FAR
 from levelproof.experts.search.play import arena, fresh_walk, play
@@ -63,6 +64,13 @@ def same(one: SearchResult, other: SearchResult) -> None:
 def begun() -> Search:
     first = np.arange(side_by_side(CONFIG))
     return begin(take(levels(), first), IDS[first], CONFIG, DEFAULT_RULES)
+
+
+def test_rounds_are_longer_than_the_numbers_of_other_random_streams() -> None:
+    """Go-Explore's streams are numbered by its env steps, those of `Draws` from 1 on."""
+    assert max(Draws) < LEAST_ROUND
+    with pytest.raises(ValueError, match="has fewer than 5"):
+        SearchConfig(lanes=4, segments=1, segment=1)
 
 
 @jax.jit

@@ -12,6 +12,7 @@ import pytest
 
 from levelproof.configs.compose import compose_job
 from levelproof.configs.errors import ConfigError
+from levelproof.experts.labels import Label
 from levelproof.levelgen.files.level_file import LevelFile, read_level_file, write_level_file
 from levelproof.levelgen.identity.content import content_hashes, level_id_for
 from levelproof.levelgen.level import SIZES, Level
@@ -27,10 +28,12 @@ from levelproof.pipeline.read.levels import levels_of
 from levelproof.pipeline.store.fields import arrays_of
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, require_manifest
 from levelproof.pipeline.store.origins import Origin
+from levelproof.pipeline.store.shard import Shard, write_shard
 from levelproof.pipeline.verify.verify import examine
 from tests.experts.search.worlds import switchback
 from tests.pipeline.command import assert_refused, here, run
 from tests.pipeline.made import assert_same, lasting
+from tests.pipeline.verify.forged import assert_reported, forge, rows_labelled
 
 pytestmark = pytest.mark.slow
 
@@ -98,6 +101,20 @@ def test_rows_have_the_file_and_an_id_from_the_content(once: Path) -> None:
     ids = [row["level_id"] for row in rows.values()]
     assert ids != list(IDS), "files do not contain the sampler's ids"
     assert len(read_manifest(once / "data/5k/s").fragments) == 1, "ids far apart share a unit"
+
+
+def test_world_of_another_engine_matches_its_hash(folder: Path) -> None:
+    """Its id does not make it again, and its signature holds no friction."""
+    split = folder / "data/5k/s"
+    forge(split, lambda row: row.update(device="gpu: of some kind"))
+    assert_reported(split)
+    shard = Shard(split / rows_labelled(split, Label.TRIVIAL)[0]["shard"])
+    arrays = shard.read()
+    arrays["level/model/friction"] = arrays["level/model/friction"] * np.float32(0.5)
+    shutil.rmtree(shard.path)
+    write_shard(shard.path, shard.level_ids, arrays)
+    forge(split)
+    assert_reported(split, "has an id, a content hash or a signature that differs from the level in its shard or file")
 
 
 def test_second_run_does_nothing_after_the_files_have_moved(folder: Path) -> None:

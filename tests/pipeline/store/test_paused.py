@@ -85,9 +85,12 @@ def test_load_paused_prefers_the_later_checkpoint(split: Path, kept: dict[int, P
     same(load_paused(split, range(8), JOB), {3: kept[7], 7: kept[7]})
 
 
-def test_load_paused_ignores_other_settings_and_versions(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("name", "other"), [("versions", {"jax": "another"}), ("device", "cpu: of another kind")])
+def test_load_paused_ignores_other_settings_and_machines(
+    split: Path, name: str, other: object, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert load_paused(split, range(8), replace(JOB, budget="8k")) == {}
-    monkeypatch.setattr(store, "versions", lambda: {"jax": "another"})
+    monkeypatch.setattr(store, name, lambda: other)
     assert load_paused(split, range(8), JOB) == {}
 
 

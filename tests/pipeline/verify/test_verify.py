@@ -148,10 +148,23 @@ def test_examine_finds_a_row_relabelled_unsolvable(split: Path, label: Label, el
 
 
 @pytest.mark.parametrize(("label", "other"), [("unsolvable", "unsolved"), ("trivial", "solved")])
-def test_examine_finds_a_label_that_hides_a_proof(split: Path, label: str, other: str) -> None:
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_examine_finds_a_label_that_hides_a_proof(split: Path, label: str, other: str, elsewhere: bool) -> None:
     level_id = rows_labelled(split, Label(label))[0]["level_id"]
     forge(split, lambda row: row.update(label=other), [level_id])
-    assert_reported(split, f"Level {level_id} is {other}, but should be {label}.")
+    sentences = [f"Level {level_id} is {other}, but should be {label}."]
+    if elsewhere:
+        forge(split, set_a_gpu)
+    assert_reported(split, *sentences * (label == "unsolvable" or not elsewhere))
+
+
+def test_examine_believes_a_gpu_what_doing_nothing_does_there(split: Path) -> None:
+    """A chaotic idle episode ends otherwise on another engine or GPU."""
+    level_id = rows_labelled(split, Label.SOLVED)[0]["level_id"]
+    forge(split, lambda row: row.update(failed_by_noop=not row["failed_by_noop"]), [level_id])
+    assert_reported(split, "by doing nothing, but the manifest says otherwise")
+    forge(split, set_a_gpu)
+    assert_reported(split)
 
 
 def test_examine_finds_exchanged_identities(split: Path) -> None:
