@@ -42,7 +42,8 @@ def run(args: argparse.Namespace) -> Report:
         f"{PROTOCOLS[RANDOM].attempts} attempts at a random level and {PROTOCOLS[HANDMADE].attempts} at a handmade "
         "one: the protocol of the reference (kinetix-env 3.0.2), whose README has the rates of `sfl-paper` and "
         "`sfl-1m-envs`. The levels are the reference's; our policies play in our engine. Unsolvable levels count. "
-        "Brackets: 95% intervals over levels; the published rates have none.",
+        "Brackets: 95% intervals over levels; the published rates have none, and this is not the first look at these "
+        "levels.",
         "Env steps are those played in training by reinforcement learning, without measurements of learnability or "
         "searches for demonstrations; `builtin:s` and `builtin:m` used neither.",
         *(

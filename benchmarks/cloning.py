@@ -95,7 +95,8 @@ def run(args: argparse.Namespace) -> Report:
         f"Each policy took {args.updates:,} updates{', with' * bool(settings)}{settings}, or twice as many where its "
         "row says so. A tenth of the levels that it was cloned from were kept from training, for validation. "
         "*Mirrored*: with `mirror=true`. Core-seconds are those of the clone, with compiling, reading and validation, "
-        "and without those of the data. The last column plays at most 1,024 of the levels, that tenth included. Every "
+        "and without those of the data; since 2026-11-29 [they are fewer](../tried/chunks.md). The last "
+        "column plays at most 1,024 of the levels, that tenth included. Every "
         "policy is the average of its last updates, not the best of its validations: few levels are passed over "
         "hundreds of times, and an earlier end might suit them better.",
         f"Points that ten times the levels add to *sampled, of solved*: {'; '.join(gains(results, PLAIN))}"

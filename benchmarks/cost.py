@@ -29,7 +29,7 @@ from levelproof.pipeline.runtime import CACHE_VARIABLE, cache_folder, own_cores
 ROOT = Path(__file__).parents[1]
 EARLIER, NOW = "earlier", "now"
 COMMIT = "0318eda"  # of 2026-11-24
-REPORT_LEVELS = "first_level=1100000"  # on which nothing was tuned
+REPORT_LEVELS = "first_level=1100000"  # levels that reports measure
 JOBS = (
     f"size=s budget=64k levels=1000 {REPORT_LEVELS}",
     f"size=m budget=256k levels=1000 {REPORT_LEVELS}",

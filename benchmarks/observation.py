@@ -79,7 +79,11 @@ def run(args: argparse.Namespace) -> Report:
     results = [measured(size, args.lanes, args.repeats) for size in args.size]
     rows = [[result["size"], *(f"{result[way]:,.0f}" for way in WAYS), *_shares(result)] for result in results]
     header = ("size", *WAYS, "observation slower by", "Lanes", "vmap")
-    table = Table(header, rows, "Env steps/s of one core; Lanes and vmap also as a share of `with`")
+    table = Table(
+        header,
+        rows,
+        f"Env steps/s of one core, the best of {args.repeats} runs; Lanes and vmap also as a share of `with`",
+    )
     return Report("The symbolic-flat observation", results, [table])
 
 

@@ -23,7 +23,7 @@ from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.runtime import prepare_jax
 
-FIRST = 1_000_000  # first level id; nothing was tuned on this level or later ones
+FIRST = 1_000_000  # first level id; the search was tuned on others
 LEVELS = {"s": 64, "m": 64, "l": 32}
 BUDGET = 256_000  # env steps of an expert
 POLISH = (16_384, 65_536, 262_144)  # env steps per witness

@@ -34,7 +34,7 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.runtime import prepare_jax
 
 BUDGET = 64_000  # env steps of an expert
-FIRST = 1_000_000  # first level id; nothing was tuned on this level or later ones
+FIRST = 1_000_000  # first level id; the search was tuned on others
 UNIT = 64  # levels at a time
 KINDS = ("chosen", "first")  # the most portable candidate, and the first candidate
 

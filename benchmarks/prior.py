@@ -83,6 +83,7 @@ def run(args: argparse.Namespace) -> Report:
         )
     total = lambda what: sum(one[what] for one in results)
     ratios = [one["attempting"] / max(one["searching_found"], 1e-9) for one in results]
+    bounds = [one["searching_found"] / one["everything"] for one in results]
     commands = "; ".join(f"`{one['command']}`" for one in results)
     return Report(
         "Attempts of a policy before the search",
@@ -106,9 +107,10 @@ def run(args: argparse.Namespace) -> Report:
             "that the attempts solve*. They are timed in CPU seconds, without compiling; the other columns are seconds "
             "of a clock, from the manifest, which other work on the machine makes longer.",
             "The policy's steps are those of its shortest attempt that reaches the goal, on levels that both solve.",
-            f"So the attempts cost {', '.join(f'{ratio:.0f}' for ratio in ratios)} times what they could save "
-            f"({', '.join(one['size'] for one in results)}), and find {total('found_of_unsolved')} of "
-            f"{total('unsolved'):,} unsolved levels. So no setting lets a policy play before "
+            f"Attempts that cost nothing would save at most {', '.join(f'{100 * share:.0f}' for share in bounds)}% "
+            f"of all core-seconds ({', '.join(one['size'] for one in results)}). {args.attempts} cost "
+            f"{', '.join(f'{ratio:.0f}' for ratio in ratios)} times that, and find {total('found_of_unsolved')} of "
+            f"{total('unsolved'):,} unsolved levels; fewer were not tried. So no setting lets a policy play before "
             "the search. Proposals within the search, and experts that start from the policy, are ruled out only "
             "[by an estimate](../tried/learners.md#a-policy-before-the-search).",
         ],

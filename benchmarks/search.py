@@ -37,7 +37,7 @@ from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.runtime import cache_folder, own_cores, prepare_jax
 
-FIRST = 1_000_000  # first level id; nothing was tuned on this level or later ones
+FIRST = 1_000_000  # first level id; the search was tuned on others
 LEVELS = {"s": 256, "m": 128, "l": 64}
 MIN_STEPS = 16_384  # env steps where the curve begins
 CONFIG = SearchConfig(

@@ -72,7 +72,8 @@ def run(args: argparse.Namespace) -> Report:
             "Bytes per solved level are those of all files, so levels that are not solved are included. Seeds keep "
             "first episodes; the rest of a released record of 256 steps is further episodes of the same expert.",
             f"The first {TRAJECTORIES:,} trajectories of each folder, from the page cache, with programs compiled "
-            "before. *Seeds* are simulated, *full* shards decoded. *First episodes* come from "
+            "before. *Seeds* are simulated up to the first success, which the rest of a record repeats; "
+            "*full* shards are decoded. *First episodes* come from "
             "`Dataset.episode_batches`; *records* from `Dataset.batches`, whole ones of 256 steps, of which the first "
             "episode counts here. The *reference* returns such records; every array is copied, and its own jitted "
             "symbolic observation is made of the states. *Lanes* plays random actions with observations, and reads "

@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> Report:
         ],
         notes=[
             f"Two workers are {np.median(ratios):.2f} times as fast as one, two processes that share nothing "
-            f"{np.median(bounds):.2f} times (medians)."
+            f"{np.median(bounds):.2f} times{' (medians)' * (args.repeats > 1)}."
         ]
         if ratios
         else [],
