@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from levelproof.configs.convert import flat, nested, plain
+from levelproof.configs.convert import flat, nested, plain, typed
 from levelproof.configs.errors import ConfigError
 from levelproof.configs.numbers import parse_count, parse_duration
 from levelproof.experts.config import ExpertConfig, StopConfig, check_budget
@@ -229,6 +229,24 @@ class GrowConfig(JobConfig):
 def from_files(results: Mapping[str, Any]) -> bool:
     """Whether a job with these `JobConfig.results` has levels that are not sampled: level files, or imported ones."""
     return results.get("distribution") in (FROM_FILES, FROM_RECORDS)
+
+
+def distribution_in(results: Mapping[str, Any]) -> Distribution | None:
+    """Return the distribution that a job with these `JobConfig.results` samples; None: its levels come from files.
+
+    Raises: as `rules_in`.
+    """
+    return None if from_files(results) else typed(Distribution, results["distribution"], "distribution")
+
+
+def rules_in(results: Mapping[str, Any]) -> TaskParams:
+    """Return the task's rules of a job with these `JobConfig.results`.
+
+    Raises:
+        ConfigError, ValueError: a setting is unknown, or has a wrong value.
+        KeyError: they are missing.
+    """
+    return typed(TaskParams, results["task"], "task")
 
 
 def is_grown(results: Mapping[str, Any]) -> bool:

@@ -3,7 +3,7 @@
 A batch with fewer lanes than its program is padded with copies of its last lane.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import jax
@@ -21,6 +21,18 @@ def blocks(count: int, size: int = LANES) -> Iterator[np.ndarray]:
     """Yield the lane indices of each batch of `size`; the last batch is padded with its last index."""
     for first in range(0, count, size):
         yield np.minimum(np.arange(first, first + size), count - 1)
+
+
+def by_blocks(program: Callable[[np.ndarray], T], count: int, size: int = LANES) -> T:
+    """Call a program with the lanes of each batch, at least one; return what it returns for all `count`, on the host.
+
+    Args:
+        program: returns arrays whose last axis has the lanes that it is called with.
+        count: number of lanes, from 1 on.
+        size: lanes per batch.
+    """
+    parts = [jax.device_get(program(lanes)) for lanes in blocks(count, size)]
+    return jax.tree.map(lambda *xs: np.concatenate(xs, -1)[..., :count], *parts)
 
 
 def block_size(count: int, most: int) -> int:

@@ -129,6 +129,8 @@ def remove_damaged(folder: Path) -> None:
             try:
                 if path.stat().st_ctime_ns >= since:  # ns; ctime, because a copy may keep its original's mtime
                     decompress_executable(path.read_bytes())
+            except OSError:  # it says nothing of the program
+                continue
             except Exception:  # each compression library raises its own type
                 path.unlink(missing_ok=True)
         new.replace(last)

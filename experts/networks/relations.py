@@ -140,7 +140,7 @@ def _rows_of(at: Float[Array, "entity body lane"], rows: Float[Array, "body row 
 
 
 def _one_hot(index: Array, count: int) -> Float[Array, "entity count lane"]:
-    return (index[:, None] == jnp.arange(count)[:, None]).astype(jnp.float32)
+    return jax.nn.one_hot(index, count, dtype=jnp.float32, axis=1)
 
 
 def _stacked(rows: list[Array]) -> Float[Array, "entity row lane"]:

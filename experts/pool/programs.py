@@ -12,6 +12,7 @@ from levelproof.experts.config import RECORD_STEPS, Rule
 from levelproof.experts.pool import rework, strengthen
 from levelproof.experts.pool.pool import GROUP, Pool, slot_count
 from levelproof.experts.search import explore, vary
+from levelproof.experts.search.play import most_steps
 from levelproof.experts.search.search import ALONE, explored, side_by_side, varied
 from levelproof.experts.search.shorten import shorten
 from levelproof.experts.training.advance import advance
@@ -107,7 +108,7 @@ def judging(pool: Pool, size: Size, trains: bool) -> list[Program]:
     some = lambda count: (levels_of(size, count), ids_of(count))
     acted = lambda count, dtype: jax.ShapeDtypeStruct((RECORD_STEPS, ACTIONS, count), dtype)
     programs = [
-        Program(examine, lambda: ((levels_of(size, LANES), rules, min(RECORD_STEPS, rules.max_timesteps)), {})),
+        Program(examine, lambda: ((levels_of(size, LANES), rules, most_steps(rules)), {})),
         Program(replay_block, lambda: ((levels_of(size, LANES), acted(LANES, np.int32), rules), {})),
     ]
     if config.replays:

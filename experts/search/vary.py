@@ -90,7 +90,7 @@ def begin(
         config: settings of the search.
     """
     count, steps = len(level_ids), nearest.code.shape[-1]
-    state = to_rows(arena(levels, config.lanes, (1.0,)).lanes.state).reshape(count, config.lanes, -1)
+    state = jnp.zeros((count, config.lanes, to_rows(levels.state).shape[-1]), jnp.float32)  # of no episode yet
     none, of_lane = jnp.zeros(count, jnp.int32), jnp.zeros((count, config.lanes), jnp.int32)
     so_far = Approaches(
         jnp.zeros((*of_lane.shape, steps), jnp.uint16), jnp.full(of_lane.shape, FAR, jnp.float32), of_lane

@@ -136,16 +136,19 @@ def _split(
     config: ExpertConfig,
 ) -> _RolloutData:
     """Split a rollout by slot, slots first."""
-    by_slot = lambda x: jnp.moveaxis(x, -2, 0)
+    action, reward, done, goal, timestep = jax.tree.map(
+        lambda x: jnp.moveaxis(x, -2, 0),
+        (trajectory.action.astype(jnp.int8), trajectory.reward, trajectory.done, trajectory.goal, trajectory.timestep),
+    )
     return _RolloutData(
         jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), LevelConstants(network.constant(levels), action_mask(levels))),
         keys,
         sample_rows(trajectory, last_value, manner.rehearsing, config),
-        by_slot(trajectory.action.astype(jnp.int8)),
-        by_slot(trajectory.reward),
-        by_slot(trajectory.done),
-        by_slot(trajectory.goal),
-        by_slot(trajectory.timestep),
+        action,
+        reward,
+        done,
+        goal,
+        timestep,
         manner.own.reshape(-1, config.environments),
     )
 

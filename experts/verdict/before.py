@@ -2,14 +2,14 @@
 
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Bool
 
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.labels import Label, Source, Verdict, trivial_reason, unsolvable_reason, untrained
+from levelproof.experts.search.play import most_steps
 from levelproof.experts.witness.witness import replay, steps_to_goal, succeeds
-from levelproof.levelgen.batching import blocks, take
+from levelproof.levelgen.batching import by_blocks, take
 from levelproof.levelgen.level import ACTIONS, Level
 from levelproof.levelgen.proofs import Facts, Proof, examine
 from levelproof.levelgen.task.rules import TaskParams
@@ -41,6 +41,4 @@ def decide(levels: Level, rules: TaskParams) -> PriorVerdicts:
 
 def facts_of(levels: Level, rules: TaskParams) -> Facts:
     """Run `levelgen.proofs.examine` on any number of levels, for one record's length; return its facts on the host."""
-    count, watched = levels.role.shape[-1], min(RECORD_STEPS, rules.max_timesteps)
-    parts = [jax.device_get(examine(take(levels, lanes), rules, watched)) for lanes in blocks(count)]
-    return jax.tree.map(lambda *xs: np.concatenate(xs, -1)[:count], *parts)
+    return by_blocks(lambda lanes: examine(take(levels, lanes), rules, most_steps(rules)), levels.role.shape[-1])

@@ -124,7 +124,10 @@ def witnesses_in(evaluation: Evaluation, config: ExpertConfig) -> list[Witness]:
         played(*episode).tobytes(): episode for episode in sorted(episodes, reverse=True)
     }  # reversed, so that the first of equal episodes is kept
     shortest = sorted(distinct.values())[: MAX_CANDIDATES if config.replays else 1]
-    return [Witness(repeated(played(*episode), episode[0]), source(episode[1]), episode[0]) for episode in shortest]
+    return [
+        Witness(repeated(played(steps, attempt, start), steps), source(attempt), steps)
+        for steps, attempt, start in shortest
+    ]
 
 
 def successful_episodes(done: Bool[np.ndarray, " time"], goal: Bool[np.ndarray, " time"]) -> list[tuple[int, int]]:

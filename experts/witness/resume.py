@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Int, UInt32
 
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.witness.witness import onwards, record_of
-from levelproof.levelgen.batching import block_size, blocks, take
+from levelproof.levelgen.batching import block_size, by_blocks, take
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import controls
@@ -65,11 +65,8 @@ def resume(
     """
     count = moves.action.shape[-1]
     given = level, moves, states, timesteps(moves.done)
-    parts = [
-        jax.device_get(_resume_block(*take(given, lanes), rules, fields))
-        for lanes in blocks(count, block_size(count, MAX_LANES))
-    ]
-    return jax.tree.map(lambda *xs: np.concatenate(xs, -1)[..., :count], *parts)
+    resumed = lambda lanes: _resume_block(*take(given, lanes), rules, fields)
+    return by_blocks(resumed, count, block_size(count, MAX_LANES))
 
 
 @partial(jax.jit, static_argnames=("rules", "fields"))

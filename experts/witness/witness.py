@@ -14,7 +14,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from levelproof.levelgen.batching import blocks, take
+from levelproof.levelgen.batching import by_blocks, take
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.programs import jit_sooner
 from levelproof.levelgen.task import rules as task
@@ -62,8 +62,8 @@ def replay(level: Level, action: ArrayLike, rules: TaskParams = DEFAULT_RULES) -
         raise ValueError(
             f"there are {len(level)} levels and actions for {count}: pass at least one level, and actions for each"
         )
-    parts = [jax.device_get(replay_block(take(level, lanes), actions[..., lanes], rules)) for lanes in blocks(count)]
-    return jax.tree.map(lambda *xs: np.ascontiguousarray(np.concatenate(xs, -1)[..., :count]), *parts)
+    record = by_blocks(lambda lanes: replay_block(take(level, lanes), actions[..., lanes], rules), count)
+    return jax.tree.map(np.ascontiguousarray, record)
 
 
 def succeeds(done: ArrayLike, goal: ArrayLike) -> Bool[np.ndarray, "..."]:

@@ -5,7 +5,6 @@ from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import numpy as np
 import pyarrow as pa
 
@@ -13,7 +12,7 @@ from levelproof.configs.schema import from_files
 from levelproof.experts.witness.episode import play_episodes
 from levelproof.levelgen.files.level_file import LevelFileError, read_level_file
 from levelproof.levelgen.identity.content import content_hashes, level_id_for
-from levelproof.levelgen.level import Level, name_of
+from levelproof.levelgen.level import Level, concatenate_levels, name_of
 from levelproof.levelgen.sampling.sampler import CHUNK
 from levelproof.physics.step import ENGINE_VERSION
 from levelproof.pipeline.errors import Failure, UserError
@@ -148,7 +147,6 @@ def _solves(about: SeedFile, rows: pa.Table, levels: list[Level]) -> np.ndarray:
         action = unpack_witnesses(rows.column("witness").to_pylist(), steps)
     except ValueError as error:
         raise damaged_seed(about.fragment.path, error) from error
-    level = jax.tree.map(lambda *lanes: np.concatenate(lanes, -1), *levels)
     rules = LevelSource.of(about.fragment.config, about.fragment.path).rules
-    played = play_episodes(level, action, steps, rules, frozenset())
+    played = play_episodes(concatenate_levels(levels), action, steps, rules, frozenset())
     return played.reaches & (played.checksum == rows.column("checksum").to_numpy())

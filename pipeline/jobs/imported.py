@@ -33,7 +33,7 @@ from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.layout import split_path
-from levelproof.pipeline.store.manifest import Manifest, read_manifest
+from levelproof.pipeline.store.manifest import Manifest, any_within, read_manifest
 from levelproof.pipeline.store.origins import Origin, RecordPlace, can_be_noted
 from levelproof.pipeline.store.remote import require_folder
 from levelproof.pipeline.store.runs import runs
@@ -79,7 +79,8 @@ def import_folder(folder: Path, out: Path, console: Console) -> Exit:
     prepare_jax()
     with writing(job, partial(say, console)) as (split, manifest):
         parts = list(_parts(source))
-        left = [part for part in parts if not _is_done(part, manifest)]
+        is_done = lambda ids: any_within(manifest.level_ids, ids[0], ids[-1])
+        left = [part for part in parts if not is_done(part.unit.level_ids)]
         _require_same_folder(source, parts, split)
         note_job(split, job, command, [(0, source.rows - 1)])
         done = len(parts) - len(left)
@@ -143,11 +144,6 @@ def _parts(folder: Folder) -> Iterator[UnitOfRows]:
             ids = range(first_id + first, first_id + min(first + rows, array.rows))
             yield UnitOfRows(array, first, WorkUnit(ids))
         first_id += array.rows
-
-
-def _is_done(part: UnitOfRows, manifest: Manifest) -> bool:
-    low, high = np.searchsorted(manifest.level_ids, [part.unit.level_ids[0], part.unit.level_ids[-1] + 1])
-    return bool(low < high)
 
 
 def _require_same_folder(folder: Folder, parts: list[UnitOfRows], split: Path) -> None:

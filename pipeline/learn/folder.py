@@ -14,6 +14,7 @@ import jax
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from levelproof.configs.convert import plain
@@ -142,7 +143,9 @@ def continued(out: Path, fresh: T) -> T:
         return fresh
     except NotRegular:
         raise
-    except Exception as error:  # the library raises types of its own
+    except OSError as error:
+        raise Failure(f"Cannot read {out / CHECKPOINT} ({error.strerror or error}): make it readable.") from None
+    except (LookupError, TypeError, ValueError, SafetensorError) as error:
         raise Failure(f"The checkpoint in {out} is damaged ({error}): start again with another -o.") from None
 
 

@@ -15,7 +15,7 @@ from levelproof.experts.generalist.demonstrations import demonstrations
 from levelproof.experts.generalist.teachers import AT_ONCE, Asked, KnownExperts, Labels, Teacher, label_states
 from levelproof.experts.generalist.visited import draw_states, state_at
 from levelproof.experts.networks.over_levels import NetworkConfig
-from levelproof.levelgen.batching import blocks, take
+from levelproof.levelgen.batching import by_blocks, take
 from levelproof.levelgen.identity.keys import key_of_seed
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.rules import TaskParams
@@ -107,11 +107,8 @@ def ask(
     """Ask the teachers about states of the learner's episodes; `rng` and `key` are consumed."""
     action, steps, solved = played.attempts
     episode, at = draw_states(rng, steps, solved, config.states, config.failed)
-    parts = []
-    for some in blocks(len(at), AT_ONCE):
-        of_block = take(played.levels, episode[some]), action[..., episode[some]], at[some]
-        parts.append(jax.device_get(state_at(*of_block, taught.rules)))
-    states = take(jax.tree.map(lambda *xs: np.concatenate(xs, -1), *parts), np.arange(len(at)))
+    into = lambda some: state_at(take(played.levels, episode[some]), action[..., episode[some]], at[some], taught.rules)
+    states = by_blocks(into, len(at), AT_ONCE)
     level = played.level[episode]
     asked = Asked(take(played.levels, episode), states, taught.witness_of(level))
     experts = taught.experts.of(level)

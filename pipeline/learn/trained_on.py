@@ -13,7 +13,7 @@ from levelproof.configs.errors import suggestion
 from levelproof.configs.train import CURRICULA, TrainConfig
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.identity.content import content_hashes
-from levelproof.levelgen.level import Level, name_of
+from levelproof.levelgen.level import Level, concatenate_levels, name_of
 from levelproof.levelgen.sampling.sampler import Sampler, sampler
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 from levelproof.pipeline.dataset.dataset import Dataset
@@ -54,7 +54,7 @@ def levels_for(config: TrainConfig, tell: Callable[[str], None]) -> TrainingLeve
     require_some_usable(place, usable)
     parts = [take(group.levels, np.flatnonzero(usable)) for group in groups]
     _require_enough(config, sum(map(len, parts)))
-    levels = jax.device_put(jax.tree.map(lambda *xs: np.concatenate(xs, -1), *parts))
+    levels = jax.device_put(concatenate_levels(parts))
     digest = hashlib.sha256("".join(hashes[usable]).encode()).hexdigest()[:16]
     facts = {"levels": str(place), "count": len(parts[0]), "content": digest}
     return TrainingLevels(str(place), levels, groups[0].rules, facts)

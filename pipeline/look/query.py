@@ -6,14 +6,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-import duckdb
 import numpy as np
 import pyarrow as pa
 from rich.console import Console
 
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.outlet import has_reader
-from levelproof.pipeline.read.select import TABLE, columns_in, select
+from levelproof.pipeline.read.select import columns_in, ids_by, select
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.columns import COLUMNS, with_current_names
 from levelproof.pipeline.store.manifest import require_manifest
@@ -50,17 +49,8 @@ def ids_of(table: pa.Table, query: RowQuery) -> np.ndarray:
     """
     ids = table.column("level_id").to_numpy()
     if query.sort is not None:
-        with duckdb.connect() as connection:
-            connection.register(TABLE, table)
-            connection.execute("SET enable_external_access = false")
-            try:
-                sql = f"SELECT level_id FROM {TABLE} ORDER BY {with_current_names(query.sort)}\n NULLS LAST, level_id"
-                ids = connection.sql(sql).fetchnumpy()["level_id"]
-            except duckdb.Error as error:
-                reason = str(error).strip().splitlines()[0]
-                raise UserError(
-                    f"Cannot sort by {query.sort!r} ({reason}): give a column, or one such as 'steps_to_goal DESC'."
-                ) from None
+        clause = f"ORDER BY {with_current_names(query.sort)}\n NULLS LAST, level_id"
+        ids = ids_by(table, clause, f"sort by {query.sort!r}", "give a column, or one such as 'steps_to_goal DESC'")
     return ids if query.limit is None else ids[: query.limit]
 
 

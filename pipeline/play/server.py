@@ -84,10 +84,13 @@ class PageConnection:
         """Answer requests until the page closes."""
         try:
             for text in self._connection:
-                request = json.loads(text)
+                try:
+                    request = json.loads(text)
+                except ValueError:  # not of our page
+                    return
                 request = request if isinstance(request, dict) else {}
                 self._send(self._answer(request) | {"id": request.get("id")})
-        except (ConnectionClosed, ValueError):
+        except ConnectionClosed:
             pass
         finally:
             self._stop.set()

@@ -55,8 +55,8 @@ class Session:
             return REQUESTS[name](self, request)
         except (UserError, EditError, LevelFileError) as error:
             return {"error": str(error)}
-        except (KeyError, TypeError, ValueError, IndexError, OverflowError):
-            return {"error": "The request is malformed."}
+        except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+            return {"error": f"The request is malformed ({type(error).__name__}: {error})."}
 
     def level(self, _: Message) -> Message:
         """Describe the initial world, and what can be edited in it."""

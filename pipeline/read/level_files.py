@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from levelproof.configs.convert import flat, plain
 from levelproof.configs.schema import JobConfig
 from levelproof.levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
 from levelproof.levelgen.identity.content import content_hashes, level_id_for
-from levelproof.levelgen.level import Level, name_of, size_of
+from levelproof.levelgen.level import Level, concatenate_levels, name_of, size_of
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.read.kinetix.folder import open_folder, read_trajectories
@@ -137,7 +136,7 @@ def levels_at(origins: Sequence[Origin]) -> Level:
                     f"The seed file {source} has changed: its level {origin.level_id} differs now, so restore the file."
                 )
         return levels
-    return jax.tree.map(lambda *lanes: np.concatenate(lanes, -1), *map(level_at, origins))
+    return concatenate_levels([level_at(origin) for origin in origins])
 
 
 def level_at(origin: Origin) -> Level:

@@ -6,15 +6,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pyarrow as pa
 
-from levelproof.configs.convert import typed
-from levelproof.configs.schema import from_files
+from levelproof.configs.schema import distribution_in, from_files, rules_in
 from levelproof.levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
 from levelproof.levelgen.identity.keys import ALIKE_VERSIONS, MAX_LEVEL_ID, SAMPLER_VERSION
-from levelproof.levelgen.level import Level, size_of
+from levelproof.levelgen.level import Level, concatenate_levels, size_of
 from levelproof.levelgen.sampling.sampler import Distribution, sample_levels
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.errors import Failure, UserError
@@ -78,7 +76,7 @@ def levels_of(manifest: Manifest, rows: pa.Table, in_command: bool = True) -> Le
         else:
             parts.append(sample_levels(others.column("level_id").to_numpy(), size, distribution))
     order = np.argsort(np.concatenate([np.flatnonzero(stored), np.flatnonzero(~stored)]))
-    return jax.tree.map(lambda *lanes: np.concatenate(lanes, -1)[..., order], *parts)
+    return concatenate_levels(parts)[order]
 
 
 class SamplerDiffers(UserWarning):
@@ -114,15 +112,14 @@ def check_sampler(manifest: Manifest) -> None:
 
 def distribution_of(manifest: Manifest) -> Distribution | None:
     """Return the distribution of a split's levels; None: they come from files. Raises as `recorded_settings`."""
-    config = manifest.config or {}
     with recorded_settings(manifest.split):
-        return None if from_files(config) else typed(Distribution, config["distribution"], "distribution")
+        return distribution_in(manifest.config or {})
 
 
 def rules_of(manifest: Manifest) -> TaskParams:
     """Return the task rules of a split. Raises as `recorded_settings`."""
     with recorded_settings(manifest.split):
-        return typed(TaskParams, (manifest.config or {})["task"], "task")
+        return rules_in(manifest.config or {})
 
 
 @contextmanager

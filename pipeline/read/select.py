@@ -35,19 +35,25 @@ def select(table: pa.Table, where: str | None) -> pa.Table:
     """
     if where is None:
         return table
+    advice = f"it is SQL over the columns {', '.join(COLUMNS.names)}"
+    chosen = ids_by(table, f"WHERE ({with_current_names(where)}\n)", f"use the condition {where!r}", advice)
+    return table.filter(np.isin(table.column("level_id").to_numpy(), chosen))
+
+
+def ids_by(table: pa.Table, clause: str, what: str, advice: str) -> np.ndarray:
+    """Return the level ids of manifest rows that the clause, part of an SQL query, selects or sorts.
+
+    Raises:
+        UserError: DuckDB rejects the clause; the sentence is made of `what` cannot be done, and the `advice`.
+    """
     with duckdb.connect() as connection:
         connection.register(TABLE, table)
-        connection.execute("SET enable_external_access = false")  # conditions must not read files
+        connection.execute("SET enable_external_access = false")  # clauses must not read files
         try:
-            sql = f"SELECT level_id FROM {TABLE} WHERE ({with_current_names(where)}\n)"
-            chosen = connection.sql(sql).fetchnumpy()["level_id"]
+            return connection.sql(f"SELECT level_id FROM {TABLE} {clause}").fetchnumpy()["level_id"]
         except duckdb.Error as error:
             reason = str(error).strip().splitlines()[0]
-            columns = ", ".join(COLUMNS.names)
-            raise UserError(
-                f"Cannot use the condition {where!r} ({reason}): it is SQL over the columns {columns}."
-            ) from None
-    return table.filter(np.isin(table.column("level_id").to_numpy(), chosen))
+            raise UserError(f"Cannot {what} ({reason}): {advice}.") from None
 
 
 def select_some(split: Path, table: pa.Table, where: str | None) -> pa.Table:

@@ -9,15 +9,15 @@ from functools import cache
 from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
-from jax.tree_util import keystr, tree_flatten_with_path
+
+from levelproof.experts.witness.resume import paths_of
 
 T = TypeVar("T")
 
 
 def arrays_of(tree: Any, path: str = "") -> dict[str, np.ndarray]:
     """Return every leaf of a nested dataclass of arrays, by its path."""
-    leaves, _ = tree_flatten_with_path(tree)
-    return {path + keystr(keys, simple=True, separator="/"): np.asarray(leaf) for keys, leaf in leaves}
+    return {path + name: np.asarray(leaf) for name, leaf in paths_of(tree).items()}
 
 
 def tree_of(cls: type[T], arrays: Mapping[str, np.ndarray], path: str = "") -> T:

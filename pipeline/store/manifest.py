@@ -133,7 +133,8 @@ def write_index(split: Path) -> None:
     files.write(split / MANIFEST / INDEX, "".join(f"{path.name}\n" for path in fragment_paths(split)).encode())
 
 
-def _any_within(ordered: np.ndarray, first: int, last: int) -> bool:
+def any_within(ordered: np.ndarray, first: int, last: int) -> bool:
+    """Return whether any of these ascending ids is from `first` to `last`."""
     low, high = np.searchsorted(ordered, [first, last + 1])
     return bool(low < high)
 
@@ -271,7 +272,7 @@ def _parts(
 
 
 def _wanted(path: Path, level_ids: np.ndarray | None) -> bool:
-    return level_ids is None or _any_within(level_ids, *ids_of(path))
+    return level_ids is None or any_within(level_ids, *ids_of(path))
 
 
 def _part(

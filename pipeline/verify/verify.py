@@ -19,13 +19,11 @@ import numpy as np
 import pyarrow as pa
 from rich.console import Console
 
-from levelproof.configs.convert import typed
 from levelproof.configs.errors import ConfigError
-from levelproof.configs.schema import from_files
+from levelproof.configs.schema import distribution_in, from_files, rules_in
 from levelproof.levelgen.identity.keys import ALIKE_VERSIONS, SAMPLER_VERSION
 from levelproof.levelgen.level import size_of
-from levelproof.levelgen.sampling.sampler import CHUNK, Distribution
-from levelproof.levelgen.task.rules import TaskParams
+from levelproof.levelgen.sampling.sampler import CHUNK
 from levelproof.pipeline.errors import Exit, Failure
 from levelproof.pipeline.read.level_files import level_at
 from levelproof.pipeline.read.levels import recorded_settings
@@ -200,9 +198,7 @@ def _recipe(split: Path, fragment: Fragment, findings: Findings) -> Recipe:
         if config["sampler_version"] not in ALIKE_VERSIONS:  # levels of alike versions are compared by signature
             raise ConfigError(f"sampler version {config['sampler_version']}, but this levelproof has {SAMPLER_VERSION}")
         size_of(config["size"])
-        rules = typed(TaskParams, config["task"], "task")
-        distribution = None if from_files(config) else typed(Distribution, config["distribution"], "distribution")
-    return Recipe(split, config["size"], distribution, rules)
+        return Recipe(split, config["size"], distribution_in(config), rules_in(config))
 
 
 def _require_one_configuration(split: Path, parts: Sequence[Part], config: dict[str, Any]) -> None:

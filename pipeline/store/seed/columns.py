@@ -9,13 +9,11 @@ import pyarrow as pa
 
 from levelproof.pipeline.store.bounds import FileKind
 from levelproof.pipeline.store.columns import stored_names
-from levelproof.pipeline.store.formats import CONFIG_KEY, HASH_KEY
 
 SEED_VERSION = "2"
 SEED_KEY = b"levelproof.seed_version"
 BUDGET_KEY = b"levelproof.budget"  # as typed
 CONTENT_KEY = b"levelproof.content_sha256"  # of the content hashes of each row group, as a JSON list
-KEYS = (SEED_KEY, BUDGET_KEY, CONTENT_KEY, HASH_KEY, CONFIG_KEY)
 
 FIELDS = (
     pa.field("level_id", pa.int32(), nullable=False),

@@ -5,16 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Int
 
-from levelproof.configs.convert import typed
 from levelproof.configs.errors import ConfigError
-from levelproof.configs.schema import MAX_FRAME_SKIP, from_files
-from levelproof.levelgen.batching import block_size, blocks, take
+from levelproof.configs.schema import MAX_FRAME_SKIP, distribution_in, rules_in
+from levelproof.levelgen.batching import block_size, by_blocks
 from levelproof.levelgen.identity.keys import SAMPLER_VERSION
-from levelproof.levelgen.level import Level, concatenate_levels, size_of
+from levelproof.levelgen.level import Level, size_of
 from levelproof.levelgen.sampling.distribution import Distribution
 from levelproof.levelgen.sampling.sampler import CHUNK, check_size, sample_chunk
 from levelproof.levelgen.task.rules import TaskParams
@@ -65,10 +63,10 @@ class LevelSource:
     def _made(config: Mapping[str, Any], path: Path) -> "LevelSource":
         """Return the source. Raise ConfigError, with what the configuration has, if this program has no such source."""
         try:
-            rules = typed(TaskParams, config["task"], "task")
+            rules = rules_in(config)
             size = size_of(config["size"])
             check_size(size)
-            distribution = None if from_files(config) else typed(Distribution, config["distribution"], "distribution")
+            distribution = distribution_in(config)
             if rules.frame_skip > MAX_FRAME_SKIP:
                 raise ConfigError(
                     f"task.frame_skip is {rules.frame_skip}, and seed files have at most {MAX_FRAME_SKIP}"
@@ -100,11 +98,8 @@ class LevelSource:
                 raise without_levels(self.path)
             return unpack_worlds([one for one in content if one is not None], self.size)
         ids = np.asarray(level_ids, np.int32)
-        lanes = block_size(len(ids), CHUNK)
-        parts = [
-            jax.device_get(sample_chunk(ids[some], self.size, self.distribution)) for some in blocks(len(ids), lanes)
-        ]
-        return take(concatenate_levels(parts), slice(len(ids)))
+        sampled = lambda some: sample_chunk(ids[some], self.size, self.distribution)
+        return by_blocks(sampled, len(ids), block_size(len(ids), CHUNK))
 
 
 def without_levels(path: Path) -> UserError:
