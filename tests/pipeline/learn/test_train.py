@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,8 @@ from levelproof.pipeline.learn import sealed
 from levelproof.pipeline.learn import train as module
 from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.trained_on import levels_for
-from tests.pipeline.command import assert_refused, here
+from tests.pace import patience, wait_until
+from tests.pipeline.command import COMMAND_SECONDS, assert_refused, here, run, start
 from tests.pipeline.learn.runs import assert_average_is_kept, assert_guide_lists, metrics, stop_after_saving
 
 LANES = (
@@ -121,6 +123,23 @@ def test_stopped_run_with_edited_levels_continues_bit_for_bit(tmp_path: Path, mo
     kept = load_file(continues_bit_for_bit(words, tmp_path, monkeypatch) / "checkpoint.safetensors")
     (index,) = (x for name, x in kept.items() if name.endswith(".level_index") and ".buffer" in name)
     assert (index >= FIRST_EXTRA).any()
+
+
+@pytest.mark.campaign
+def test_stopped_run_on_two_cores_continues_bit_for_bit(split: Path, tmp_path: Path) -> None:
+    """In processes of their own: JAX's devices are fixed once it has started."""
+    words = [f"levels={split}", f"ppo.env_steps={20 * PER_UPDATE}", *LANES[:-1], "cores=2", "interval=1", *TINY]
+    for name in ("whole", "stopped"):
+        (tmp_path / name).mkdir()
+    assert run(["train", "-o", "agent", *words], tmp_path / "whole").returncode == 0
+    process = start(["train", "-o", "agent", *words], tmp_path / "stopped")
+    wait_until((tmp_path / "stopped/agent/policy.safetensors").exists, COMMAND_SECONDS)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(patience(COMMAND_SECONDS)) == 130
+    assert load_file(tmp_path / "stopped/agent/checkpoint.safetensors")[".updates"] < 20
+    assert run(["train", "-o", "agent", *words], tmp_path / "stopped").returncode == 0
+    for name in FILES:
+        assert (tmp_path / "stopped/agent" / name).read_bytes() == (tmp_path / "whole/agent" / name).read_bytes()
 
 
 def continues_bit_for_bit(words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
