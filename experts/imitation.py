@@ -11,10 +11,11 @@ import optax
 from flax.typing import VariableDict
 from jaxtyping import Array, Float, Int
 
-from levelproof.experts.networks.chunks import in_chunks, lanes_at_once, mean_gradient
+from levelproof.experts.networks.chunks import lanes_at_once, mean_gradient
 from levelproof.experts.networks.over_levels import NetworkConfig, initial_policy, policy_logits
 from levelproof.experts.optimise import running_average
 from levelproof.experts.policy import log_probability, most_probable
+from levelproof.levelgen.batching import split_lanes
 from levelproof.levelgen.identity.keys import key_of_seed
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.actions import action_mask
@@ -109,7 +110,7 @@ def _chunks(transitions: Transitions) -> Transitions:
     """Return transitions as chunks that go through the network one after another, chunk axis first."""
     lanes = lanes_at_once(transitions.level.size, len(transitions.motion))
     rows = (x.reshape(-1, lanes, x.shape[-1]) for x in (transitions.motion, transitions.action))
-    return Transitions(in_chunks(transitions.level, lanes), *rows)
+    return Transitions(split_lanes(transitions.level, lanes), *rows)
 
 
 @partial(jax.jit, static_argnames="network")

@@ -60,3 +60,14 @@ def take(tree: T, lanes: np.ndarray | slice) -> T:
 def repeat(tree: T, lanes: int) -> T:
     """Copy each level into `lanes` neighbouring lanes."""
     return jax.tree.map(lambda x: jnp.repeat(x, lanes, axis=-1), tree)
+
+
+def split_lanes(tree: T, lanes: int) -> T:
+    """Cut arrays [..., lane] into parts of `lanes` neighbouring lanes: [part, ..., lane]."""
+    cut = lambda x: x.reshape(*x.shape[:-1], x.shape[-1] // lanes, lanes)
+    return jax.tree.map(lambda x: jnp.moveaxis(cut(x), -2, 0), tree)
+
+
+def merge_lanes(tree: T) -> T:
+    """Join arrays [part, ..., lane] to [..., lane], the inverse of `split_lanes`."""
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], x.shape[0] * x.shape[-1]), tree)

@@ -6,7 +6,7 @@ turning a body also moves every body that joints hold to it. Masses are computed
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -169,8 +169,8 @@ def bind(level: Level, kind: str, index: int, binding: int) -> Level:
     """Choose the entry of an action that a `joint`'s motor or a `thruster` obeys."""
 
     def change(one: Level) -> None:
-        (active, bindings), count = (get(one) for get in OF_KIND[kind]), BINDINGS[kind]
-        bindings[_active(active, index, kind)] = binding % count
+        of_kind = ACTUATORS[kind]
+        of_kind.bindings(one)[_active(of_kind.active(one), index, kind)] = binding % of_kind.entries
 
     return _edited(level, change)
 
@@ -180,7 +180,7 @@ def delete(level: Level, kind: str, index: int) -> Level:
 
     def change(one: Level) -> None:
         if kind != "body":
-            active = OF_KIND[kind][0](one)
+            active = ACTUATORS[kind].active(one)
             active[_active(active, index, kind)] = False
             return
         model, body = one.model, _movable(one, index)
@@ -191,10 +191,17 @@ def delete(level: Level, kind: str, index: int) -> Level:
     return _edited(level, change)
 
 
-BINDINGS = {"joint": MOTOR_BINDINGS, "thruster": THRUSTER_BINDINGS}
-OF_KIND: dict[str, tuple[Callable[[Level], Any], Callable[[Level], Any]]] = {  # active flags, bindings
-    "joint": (lambda one: one.model.joint_active, lambda one: one.motor_binding),
-    "thruster": (lambda one: one.model.thruster_active, lambda one: one.thruster_binding),
+class Actuators(NamedTuple):
+    """A kind of actuators of a level."""
+
+    active: Callable[[Level], Any]  # returns their flags
+    bindings: Callable[[Level], Any]
+    entries: int  # of an action, which they may be bound to
+
+
+ACTUATORS = {
+    "joint": Actuators(lambda one: one.model.joint_active, lambda one: one.motor_binding, MOTOR_BINDINGS),
+    "thruster": Actuators(lambda one: one.model.thruster_active, lambda one: one.thruster_binding, THRUSTER_BINDINGS),
 }
 EDITS: dict[str, Callable[..., Level]] = {
     edit.__name__: edit for edit in (add_body, move, turn, resize, set_role, fix, add_joint, add_thruster, bind, delete)

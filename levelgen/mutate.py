@@ -15,9 +15,8 @@ from jaxtyping import Array, Bool
 
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.edit import (
-    BINDINGS,
+    ACTUATORS,
     MAX_REACH,
-    OF_KIND,
     SHAPES,
     EditError,
     add_body,
@@ -162,8 +161,8 @@ def _add_thruster(level: Level, rng: np.random.Generator) -> Level:
 
 def _bind(level: Level, rng: np.random.Generator) -> Level:
     kind = ("joint", "thruster")[rng.integers(2)]
-    row, bindings = _one_of_kind(level, kind, rng), OF_KIND[kind][1](level)
-    return bind(level, kind, row, int(bindings[row, 0]) + int(rng.integers(1, BINDINGS[kind])))
+    row, bindings = _one_of_kind(level, kind, rng), ACTUATORS[kind].bindings(level)
+    return bind(level, kind, row, int(bindings[row, 0]) + int(rng.integers(1, ACTUATORS[kind].entries)))
 
 
 def _delete(level: Level, rng: np.random.Generator) -> Level:
@@ -186,7 +185,7 @@ def _role(level: Level, body: int) -> Role:
 
 
 def _one_of_kind(level: Level, kind: str, rng: np.random.Generator) -> int:
-    return _chosen(np.flatnonzero(np.asarray(OF_KIND[kind][0](level))), kind, rng)
+    return _chosen(np.flatnonzero(np.asarray(ACTUATORS[kind].active(level))), kind, rng)
 
 
 def _chosen(rows: Any, kind: str, rng: np.random.Generator) -> int:

@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Int
 
+from levelproof.levelgen.batching import merge_lanes, split_lanes
+
 OnLanes = Callable[[Any, Int[Array, " lane"], Any], Any]
 
 
@@ -28,15 +30,14 @@ def single(on_lanes: OnLanes) -> Callable[[Any, Int[Array, ""] | int, Any], Any]
     @merged.def_vmap
     def as_lanes(batch: int, is_mapped: Any, table: Any, index: Array, inputs: Any) -> tuple[Any, Any]:
         lanes = index.shape[-1]
-        merge = lambda x, mapped: _merge(x if mapped else jnp.broadcast_to(x, (batch, *x.shape)))
+        merge = lambda x, mapped: merge_lanes(x if mapped else jnp.broadcast_to(x, (batch, *x.shape)))
         table_mapped, index_mapped, inputs_mapped = is_mapped
         index = merge(index, index_mapped)
         if any(jax.tree.leaves(table_mapped)):
             rows = jax.tree.leaves(table)[0].shape[-1]
             table = jax.tree.map(merge, table, table_mapped)
             index = index + rows * jnp.repeat(jnp.arange(batch, dtype=index.dtype), lanes)
-        result = merged(table, index, jax.tree.map(merge, inputs, inputs_mapped))
-        result = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], batch, lanes), -2, 0), result)
+        result = split_lanes(merged(table, index, jax.tree.map(merge, inputs, inputs_mapped)), lanes)
         return result, jax.tree.map(lambda _: True, result)
 
     def of_one(table: Any, index: Int[Array, ""] | int, inputs: Any) -> Any:
@@ -44,8 +45,3 @@ def single(on_lanes: OnLanes) -> Callable[[Any, Int[Array, ""] | int, Any], Any]
         return jax.tree.map(lambda x: x[..., 0], result)
 
     return of_one
-
-
-def _merge(x: Array) -> Array:
-    """Merge [batch, ..., lane] into [..., batch * lane]."""
-    return jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], x.shape[0] * x.shape[-1])

@@ -22,12 +22,13 @@ from levelproof.experts.generalist.config import CHUNK, PPOConfig
 from levelproof.experts.generalist.curricula import Curriculum, EndedEpisodes
 from levelproof.experts.generalist.rollout import Ended, Experience, Playing, begin, rollout
 from levelproof.experts.generalist.subsample import LEAST, choose
-from levelproof.experts.networks.chunks import in_chunks, lanes_at_once, mean_gradient
+from levelproof.experts.networks.chunks import lanes_at_once, mean_gradient
 from levelproof.experts.networks.layers import LOGITS
 from levelproof.experts.networks.over_levels import NetworkConfig, logits_and_summary
 from levelproof.experts.objective import advantages, normalised_over, terms
 from levelproof.experts.optimise import clipped_adam, running_average
 from levelproof.experts.policy import divergence
+from levelproof.levelgen.batching import split_lanes
 from levelproof.levelgen.identity.keys import key_of_seed
 from levelproof.levelgen.task.lanes import Table
 from levelproof.levelgen.task.rules import TaskParams
@@ -221,7 +222,7 @@ def _chunks(
     samples = _samples(recipe.ppo, experience, key)
     width = lanes_at_once(recipe.size, min(samples.value.shape[-1], CHUNK))
 
-    parted = jax.vmap(partial(in_chunks, lanes=width))(samples)  # time first, then the chunks of each time step
+    parted = jax.vmap(partial(split_lanes, lanes=width))(samples)  # time first, then the chunks of each time step
     chunks = jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), parted)
     if start is None:
         return chunks

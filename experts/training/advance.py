@@ -23,10 +23,10 @@ from levelproof.experts.policy import ActorCritic, network_of
 from levelproof.experts.training import ppo, progress, stop
 from levelproof.experts.training.ppo import LevelConstants, Samples
 from levelproof.experts.training.rollout import Acting, ActionRule, Trajectory, rollout, start
-from levelproof.experts.training.slots import EvaluationState, Mode, Report, Slot, Slots, Training, by_slot, lanes_of
+from levelproof.experts.training.slots import EvaluationState, Mode, Report, Slot, Slots, Training
 from levelproof.experts.training.stop import StopRules
 from levelproof.experts.witness.success import find, remember
-from levelproof.levelgen.batching import repeat
+from levelproof.levelgen.batching import merge_lanes, repeat, split_lanes
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.programs import jit_stored
@@ -58,7 +58,7 @@ def advance(slots: Slots, config: ExpertConfig, stopping: StopRules, rules: Task
 
     trains = repeat(~evaluating, config.environments)
     fresh = repeat(slot.trial.part == 0, config.environments)
-    training, trial = lanes_of(slots.acting), lanes_of(slots.trial)
+    training, trial = merge_lanes(slots.acting), merge_lanes(slots.trial)
     acting = _where(trains, training, _where(fresh, _perturbed_start(lanes, keys, config), trial))
 
     network = network_of(levels.size, config)
@@ -70,7 +70,7 @@ def advance(slots: Slots, config: ExpertConfig, stopping: StopRules, rules: Task
     slot, share, mode = over_slots(partial(_follow, network=network, config=config, stopping=stopping), slot, now)
     left = (slot.mode == Mode.EMPTY) & (mode == Mode.EVALUATE)
     evaluated = (mode == Mode.EVALUATE) & (left | slot.trial.solved)
-    training, trial = (by_slot(lanes, config.environments) for lanes in (_where(trains, acting, training), acting))
+    training, trial = (split_lanes(lanes, config.environments) for lanes in (_where(trains, acting, training), acting))
     early = left & slot.trial.solved & ~slot.trial.final
     after = replace(slots, slot=slot, acting=training, trial=trial)
     return after, Report(mode, share, evaluated, left, early)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from levelproof.experts.training.progress import Progress
 from levelproof.experts.training.rollout import Acting, start
 from levelproof.experts.training.stop import StopState
 from levelproof.experts.witness.success import Success
-from levelproof.levelgen.batching import repeat
+from levelproof.levelgen.batching import repeat, split_lanes
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.programs import jit_quickly, jit_sooner
@@ -134,7 +134,7 @@ def begin(levels: Level, level_ids: Int[Array, " level"], success: Success, conf
         return Training(train_state, progress.start(lanes), stop.begin(), success, recent)
 
     experts = jax.vmap(training, in_axes=(0, -1, 0))(level_ids, network.constant(levels), success)
-    return ExpertState(experts, by_slot(start(repeat(levels, lanes)), lanes))
+    return ExpertState(experts, split_lanes(start(repeat(levels, lanes)), lanes))
 
 
 @jit_quickly(static_argnames="config")
@@ -154,14 +154,3 @@ def slots_of(
     trial = EvaluationState(jnp.zeros_like(mode), due, final, jnp.zeros_like(final), action, done, goal)
     slot = Slot(mode, deadline, experts.training, trial)
     return Slots(levels, level_ids, slot, experts.acting, experts.acting)
-
-
-def lanes_of(tree: Any) -> Any:
-    """Reshape [slot, ..., environment] to [..., lane]."""
-    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], x.shape[0] * x.shape[-1]), tree)
-
-
-def by_slot(tree: Any, environments: int) -> Any:
-    """Reshape [..., lane] to [slot, ..., environment]."""
-    apart = lambda x: x.reshape(*x.shape[:-1], x.shape[-1] // environments, environments)
-    return jax.tree.map(lambda x: jnp.moveaxis(apart(x), -2, 0), tree)
