@@ -22,7 +22,7 @@ class Outlet:
             return self._stream.write(text)
         except UnicodeEncodeError:  # a path that is not UTF-8, or a terminal that knows few characters
             encoding = self._stream.encoding
-            return self._stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
+            return self.write(text.encode(encoding, "backslashreplace").decode(encoding))
         except self._ignored:
             self._drop()
             return len(text)

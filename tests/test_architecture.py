@@ -35,7 +35,7 @@ MAY_IMPORT = {
     "levelgen.frames": ("physics",),
     "levelgen.level": ("physics",),
     "levelgen.identity": ("levelgen.level", "physics"),
-    "levelgen.vmapped": (),
+    "levelgen.vmapped": ("levelgen.batching",),
     "levelgen.programs": ("physics.codegen",),
     "levelgen.sampling": ("levelgen.identity", "levelgen.level", "levelgen.programs", "levelgen.vmapped", "physics"),
     "levelgen.task": ("levelgen.sampling", "levelgen.level", "levelgen.vmapped", "physics"),

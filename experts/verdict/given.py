@@ -33,12 +33,14 @@ def label_given(
     whole, done, steps = succeeds(record.done, record.goal), np.asarray(record.done), steps_to_goal(record.done)
     at_first = np.take_along_axis(np.asarray(record.goal), steps[None] - 1, 0)[0]
     ends = done[steps - 1, np.arange(len(steps))]  # whether any episode ends
-    for i, verdict in enumerate(before):
-        if verdict is not None and verdict.label == Label.UNSOLVABLE and (whole[i] or at_first[i]):
-            warnings.warn(
-                f"Imported actions solve a level that is proved unsolvable: {verdict.label_reason}", stacklevel=2
-            )
-            before[i] = None
+    beaten = np.array([v is not None and v.label == Label.UNSOLVABLE for v in before]) & (whole | at_first)
+    if beaten.any():
+        reason = next(v.label_reason for v, wins in zip(before, beaten, strict=True) if v and wins)
+        warnings.warn(
+            f"Imported actions solve {beaten.sum()} of {len(before)} levels that are proved unsolvable: {reason}",
+            stacklevel=2,
+        )
+    before = [None if wins else v for v, wins in zip(before, beaten, strict=True)]
     new = action.copy()
     for i, verdict in enumerate(before):
         if verdict is not None:

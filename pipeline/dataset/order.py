@@ -5,6 +5,7 @@ cycles until it is back in range (Black and Rogaway, Ciphers with Arbitrary Fini
 finaliser of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014) as its round function. It is not cryptographically secure.
 """
 
+import operator
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,8 +65,11 @@ class EpochOrder:
 
 
 def plain(value: Any) -> Any:
-    """Return numpy's integer as Python's, which JSON can hold; other values unchanged."""
-    return int(value) if isinstance(value, np.integer) else value
+    """Return an integer of numpy or JAX as Python's, which JSON can hold; other values unchanged."""
+    try:
+        return operator.index(value)
+    except TypeError:
+        return value
 
 
 def permute(positions: Int[np.ndarray, "*n"], count: int, seed: int, epoch: int = 0) -> Int[np.ndarray, "*n"]:

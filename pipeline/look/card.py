@@ -58,7 +58,6 @@ def card(splits: Sequence[Path], out: Path | None, options: CardOptions) -> None
             without `out`, or the file exists and is not a card.
         Failure: a split is damaged.
     """
-    splits = list(dict.fromkeys(splits))
     root, remote = _above(splits[0]), is_remote(splits[0])
     if remote and out is None:
         raise UserError(
@@ -70,8 +69,8 @@ def card(splits: Sequence[Path], out: Path | None, options: CardOptions) -> None
     _require_ours(out)
     _require_plain([out])
     prepare_jax()  # to hash levels of seeds, and to draw
-    paths = [_below(root if remote else folder, split) for split in splits]
-    manifests = [require_manifest(split, COLUMNS_READ, compact=True) for split in splits]
+    named = {_below(root if remote else folder, split): split for split in splits}  # each once, however it is written
+    paths, manifests = [*named], [require_manifest(split, COLUMNS_READ, compact=True) for split in named.values()]
     facts = [_facts(path, manifest) for path, manifest in zip(paths, manifests, strict=True)]
     _require_own_names(facts)
     with writing_to(out):

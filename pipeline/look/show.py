@@ -189,8 +189,8 @@ def write_mp4(film: Film, path: Path) -> None:
     program = shutil.which("ffmpeg") or packaged_ffmpeg()
     if program is None:
         raise UserError(
-            f"Cannot draw to {path}: MP4 needs the program ffmpeg. "
-            "Run `pip install imageio-ffmpeg`, or use a name ending in .gif."
+            "Cannot draw an MP4, because this machine has no ffmpeg: run `pip install imageio-ffmpeg`, or use a name "
+            "ending in .gif."
         )
     rate = 1 / film.seconds[0]
     rest = round(film.seconds[-1] * rate)

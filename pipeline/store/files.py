@@ -41,9 +41,12 @@ def write(path: Path, data: bytes, mode: int = 0o666, durable: bool = False) -> 
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a new, empty file beside `path`, with its suffix, which replaces it when the block ends without an error.
 
+    If `path` is a link, the file that it leads to is replaced.
+
     Raises:
         OSError: the folder cannot be written.
     """
+    path = path.resolve()
     unfinished = path.with_name(f".{os.getpid()}.{path.name}")
     try:
         unfinished.unlink(missing_ok=True)  # perhaps a link to another file

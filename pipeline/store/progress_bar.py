@@ -2,12 +2,14 @@
 
 import time
 from collections.abc import Iterator
+from threading import Lock
 from types import TracebackType
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 LINE_EVERY = 30.0  # s between plain lines
+ON_TERMINAL = Lock()  # held by the bar on the terminal: one within its block, as of a read, would draw over it
 
 
 class ProgressBar:
@@ -19,22 +21,29 @@ class ProgressBar:
         columns = BarColumn(), TaskProgressColumn(), TextColumn("{task.description}"), TimeRemainingColumn()
         self._bar = Progress(*columns, console=console, transient=True, disable=self._quiet)
         self._task = self._bar.add_task("", total=max(total, 1))
+        self._shows = False
 
     def __enter__(self) -> "ProgressBar":
-        self._bar.start()
+        self._shows = not self._quiet and ON_TERMINAL.acquire(blocking=False)
+        if self._shows:
+            self._bar.start()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._bar.stop()
+        if self._shows:
+            self._bar.stop()
+            ON_TERMINAL.release()
 
     def advance(self, count: int) -> None:
         """Add `count` finished items."""
+        if self._console is None:
+            return
         self._bar.advance(self._task, count)
         (task,) = self._bar.tasks
         pace = f" · {task.speed:,.0f}/s" if task.speed else ""  # unknown after a pause
         text = f"{task.completed:,.0f}/{task.total:,.0f} {self._what}{pace}"
         self._bar.update(self._task, description=text)
-        if self._quiet and self._console and time.monotonic() - self._line_at >= LINE_EVERY:
+        if self._quiet and time.monotonic() - self._line_at >= LINE_EVERY:
             self._line_at = time.monotonic()
             left = f" · about {task.time_remaining:,.0f} s left" if task.time_remaining else ""
             self._console.print(text + left, highlight=False, markup=False, soft_wrap=True)

@@ -284,6 +284,11 @@ class Evidence:
         """
         verdicts, failed = decide(levels, self.recipe.rules)
         labels, reasons = self.columns["label"], self.columns["label_reason"]
+        # A replayed witness overrules a proof that there is none
+        beaten = [
+            v and v.label == Label.UNSOLVABLE and label in WITNESSED for v, label in zip(verdicts, labels, strict=True)
+        ]
+        verdicts = [None if wins else v for v, wins in zip(verdicts, beaten, strict=True)]
         rows = list(zip(verdicts, labels, reasons, strict=True))
         wrong = np.array([label != v.label if v else label not in TRAINED for v, label, _ in rows])
         proved = np.array([v is not None and v.label == Label.UNSOLVABLE for v in verdicts])

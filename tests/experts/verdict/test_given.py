@@ -22,7 +22,7 @@ def test_witness_overrules_a_proof_that_there_is_none(monkeypatch: pytest.Monkey
     ]
     wrong = [untrained(Label.UNSOLVABLE, "wrongly proved", False), verdicts[at[1]]]
     monkeypatch.setattr(given, "decide", lambda *_: (list(wrong), failed[at]))
-    with pytest.warns(UserWarning, match="a level that is proved unsolvable: wrongly proved"):
+    with pytest.warns(UserWarning, match="solve 1 of 2 levels that are proved unsolvable: wrongly proved"):
         record, labelled = given.label_given(
             take(levels, np.array(at)), np.zeros((RECORD_STEPS, ACTIONS, 2), np.int32), DEFAULT_RULES
         )

@@ -1,5 +1,6 @@
 """`EpochOrder` and `permute`: every item once per epoch, in random order, apportioned evenly to hosts."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -78,7 +79,7 @@ def test_items_of_several_batches_are_those_of_each() -> None:
 def test_integers_of_numpy_are_those_of_python() -> None:
     """Positions are saved as JSON."""
     names = ("batch_size", "seed", "process_index", "process_count")
-    given = dict(zip(names, np.array([2, 7, 0, 2]), strict=True))
+    given = dict(zip(names, (np.int64(2), jnp.int32(7), np.array(0), np.uint8(2)), strict=True))
     assert EpochOrder(10, **given) == EpochOrder(10, 2, 7, 0, 2)
     assert all(type(getattr(EpochOrder(10, **given), name)) is int for name in names)
 

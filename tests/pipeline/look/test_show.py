@@ -166,7 +166,7 @@ def test_show_keeps_the_earlier_film_if_a_new_one_fails(split, tmp_path, monkeyp
 def test_show_mp4_needs_ffmpeg(split, tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(UserError, match="ffmpeg"):
+    with pytest.raises(UserError, match=r"^Cannot draw an MP4, because this machine has no ffmpeg"):
         show(split, level_with(split, "solved"), tmp_path / "other.mp4")
 
 

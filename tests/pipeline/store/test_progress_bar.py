@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from levelproof.pipeline.store import progress_bar
-from levelproof.pipeline.store.progress_bar import ProgressBar
+from levelproof.pipeline.store.progress_bar import ProgressBar, shown_blocks
 
 
 def test_line_has_no_rate_before_one_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -19,3 +19,29 @@ def test_line_has_no_rate_before_one_is_known(monkeypatch: pytest.MonkeyPatch) -
     assert first == "10/100 levels"
     assert second.startswith("30/100 levels · ")
     assert "/s · about " in second
+
+
+def test_blocks_are_counted_in_items_and_only_if_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress_bar, "LINE_EVERY", 0.0)
+    text = io.StringIO()
+    assert [*shown_blocks(10, 4, "levels", Console(file=text))] == [0, 4, 8]
+    assert [line.split(" · ")[0] for line in text.getvalue().splitlines()] == [f"{n}/10 levels" for n in (4, 8, 10)]
+    few = io.StringIO()
+    assert [*shown_blocks(10, 4, "levels", Console(file=few), least=11)] == [0, 4, 8]
+    assert [*shown_blocks(0, 4, "levels", Console(file=few))] == []
+    assert not few.getvalue()
+
+
+def test_bar_within_a_bar_is_not_drawn() -> None:
+    """Two would move one cursor."""
+    outer, inner = (Console(file=io.StringIO(), force_terminal=True) for _ in range(2))
+    with ProgressBar("rows", 2, outer) as bar:
+        bar.advance(1)
+        with ProgressBar("fragments", 2, inner) as other:
+            other.advance(1)
+        bar.advance(1)
+    assert not inner.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
+    with ProgressBar("fragments", 2, inner) as other:
+        other.advance(1)
+    for console in (outer, inner):
+        assert console.file.getvalue()  # pyright: ignore[reportAttributeAccessIssue]

@@ -13,9 +13,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from levelproof.experts.labels import WITNESSED, Label
+from levelproof.experts.labels import WITNESSED, Label, untrained
+from levelproof.experts.verdict.before import PriorVerdicts, decide
 from levelproof.experts.witness.witness import replay
 from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
+from levelproof.levelgen.level import Level
+from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.errors import Failure, StoreFailure
 from levelproof.pipeline.jobs import repair as repairing
 from levelproof.pipeline.store import fragment, remote
@@ -165,6 +168,20 @@ def test_examine_believes_a_gpu_what_doing_nothing_does_there(split: Path) -> No
     assert_reported(split, "by doing nothing, but the manifest says otherwise")
     forge(split, set_a_gpu)
     assert_reported(split)
+
+
+def test_examine_believes_a_witness_rather_than_a_proof(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of imported actions that solve a level which is wrongly proved unsolvable."""
+    wrong = untrained(Label.UNSOLVABLE, "wrongly proved", False)
+
+    def all_unsolvable(levels: Level, rules: TaskParams) -> PriorVerdicts:
+        verdicts, failed = decide(levels, rules)
+        return PriorVerdicts([verdict or wrong for verdict in verdicts], failed)
+
+    monkeypatch.setattr(evidence, "decide", all_unsolvable)
+    unsolved = rows_labelled(split, Label.UNSOLVED)
+    sentences = sorted(f"Level {row['level_id']} is unsolved, but should be unsolvable." for row in unsolved)
+    assert sorted(examine(split).sentences) == sentences
 
 
 def test_examine_finds_exchanged_identities(split: Path) -> None:
