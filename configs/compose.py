@@ -167,7 +167,7 @@ def _compose(overrides: list[str]) -> dict[str, Any]:
 def _parse(text: str) -> Override:
     """Parse one `key=value`; take a value that Hydra's grammar cannot read (`out=my data/é`) as a plain string.
 
-    Warns if the key is the name of a setting in the last version, and returns today's.
+    If the key is a setting's name in the previous version, warns and uses today's name.
     """
     key, equals, value = text.partition("=")
     if new := RENAMED.get(key):
@@ -257,7 +257,7 @@ def compose_train(overrides: Sequence[str]) -> "TrainConfig":
     if config.start and config.ppo.critic_updates >= config.ppo.updates:
         raise ConfigError(
             f"ppo.env_steps gives {config.ppo.updates} updates, and the first {config.ppo.critic_updates} "
-            "(ppo.critic_updates) leave the policy as it is: raise the one or lower the other."
+            "leave the policy as it is: raise ppo.env_steps or lower ppo.critic_updates."
         )
     _require_no_network(config.start, parsed)
     _require_heads(config.network.kind, parsed)

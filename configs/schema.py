@@ -33,7 +33,7 @@ MAX_BODIES = 48  # the largest number that was tested; compiling takes minutes a
 UNITS = ((SIZES["s"].bodies, 32), (SIZES["m"].bodies, 16), (SIZES["l"].bodies, 8), (MAX_BODIES, 4))
 GROWN_UNIT = 8  # size of a unit that grows records from seeds, as a multiple of a unit that trains
 
-# Settings of place, amount and machine: they change neither a level nor its expert, so a split may mix their values
+# Settings of path, amount and machine: they change neither a level nor its expert, so a split may mix their values
 WITHOUT_EFFECT = frozenset(
     {
         "levels",

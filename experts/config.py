@@ -116,7 +116,7 @@ class StopConfig:
     """When a level leaves its slot."""
 
     rule: Rule = Rule.HALVING  # when a level leaves its slot
-    successes: int = 1  # attempts of an evaluation that must succeed for a level to leave early; a witness takes one
+    successes: int = 1  # attempts of an evaluation that must succeed for a level to leave early; a witness needs one
     share: float = 0.25  # share of an update's finished episodes that must reach the goal to trigger an evaluation
     wait: int = 2048  # env steps of training between a failed evaluation and the next; doubles up to six times
     polish: int = 0  # env steps of training after a level is solved, to shorten its witness; 0: none

@@ -56,7 +56,7 @@ def normalised(advantage: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 def normalised_over(axis_name: str, advantage: Float[Array, "..."], counts: Bool[Array, "..."]) -> Float[Array, "..."]:
-    """Do as `normalised` for the samples that count, distributed over a mapped axis; the others' advantage is 0."""
+    """Normalise over the samples that count, across a mapped axis; the others' advantage is 0."""
     total = lambda x: jax.lax.psum(jnp.where(counts, x, 0.0).sum(), axis_name)
     count = jnp.maximum(total(1.0), 1.0)
     centred = jnp.where(counts, advantage - total(advantage) / count, 0.0)

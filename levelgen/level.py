@@ -109,8 +109,8 @@ def size_of(name: str | Size) -> Size:
         return SIZES[name]
     if not re.fullmatch(r"(0|[1-9][0-9]{0,3})(-(0|[1-9][0-9]{0,3})){3}", name):
         raise ValueError(
-            f"size is {name!r}: choose one of {', '.join(SIZES)}, or write how many polygons (4 of them scenery), "
-            "circles, joints and thrusters there is room for, as in 8-8-8-4"
+            f"size is {name!r}: choose one of {', '.join(SIZES)}, or give the numbers of polygons (4 are scenery), "
+            "circles, joints and thrusters, as in 8-8-8-4"
         )
     size = Size(*map(int, name.split("-")))
     if name_of(size) != name:

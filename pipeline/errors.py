@@ -23,7 +23,7 @@ class LevelproofError(Exception):
     exit_code = Exit.FAILED
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _with_message, (type(self), *self.args)  # some types make their messages of other arguments
+        return _with_message, (type(self), *self.args)  # some types build their messages from other arguments
 
     def __str__(self) -> str:
         """Return the message with URLs as typed: `Path` turns `s3://` into `s3:/`."""

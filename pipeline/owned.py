@@ -30,7 +30,7 @@ def require_own(path: Path, instead: str) -> None:
     """Check that another user neither owns a path nor can write to it; do nothing on systems without user ids.
 
     Raises:
-        UserError: another user does or can; the message ends with `instead`, which says what to do.
+        UserError: another user owns it or can write to it; the message ends with `instead`, which says what to do.
     """
     if not hasattr(os, "getuid") or not path.exists():
         return

@@ -107,7 +107,7 @@ def prepare_jax(
 def spare_imports() -> None:
     """Exempt what this process's imports have made from garbage collection, once.
 
-    Tracing makes the collector run often, and it would look at all of that each time.
+    Tracing makes the collector run often, and each run would scan all these objects.
     """
     if not gc.get_freeze_count():
         gc.freeze()

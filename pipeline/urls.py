@@ -29,6 +29,6 @@ def require_here(path: Path) -> None:
 
 
 def require_policy(path: Path) -> None:
-    """Raise UserError as `require_known`, but take the name of a policy that comes with levelproof for no URL."""
+    """Raise UserError as `require_known` does, but accept names of built-in policies, such as builtin:s."""
     if not str(path).startswith(BUILTIN):
         require_known(path)

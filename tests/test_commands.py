@@ -19,7 +19,7 @@ BUDGETS = {"64k": "3k", "128k": "4k", "256k": "5k", "1M": "6k"}  # budgets on a 
 JOBS = ("generate", "regenerate", "plan", "grow")
 ELSEWHERE = ("levelproof play", "://", "HEAD:", "me/levels")  # servers and other hosts, which tests/pipeline tests
 WITH_WORKERS = ("README", "cluster")  # pages whose jobs run on Ray; those of other pages run in this process
-NO_MATCH = "No level", "no trajectories", "holds for none", "too few levels"  # a condition fits none of so few levels
+NO_MATCH = "No level", "no trajectories", "too few levels"  # a condition fits none of so few levels
 LEARNERS = "clone", "train", "distill"  # whose levels are made so that some fit
 
 

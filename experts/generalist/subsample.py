@@ -18,7 +18,7 @@ LEAST = 1e-6  # added to every chance: if all gains are 0, samples are chosen ev
 def choose(
     gain: Float[Array, "time lane"], counts: Bool[Array, "time lane"], samples: int, key: Key[Array, ""]
 ) -> tuple[Int[Array, "time sample"], Float[Array, "time sample"]]:
-    """Choose as many lanes at every time, with chances that grow with the size of their gain.
+    """Choose `samples` lanes per time step, with probabilities that grow with |gain|.
 
     The choice is systematic: a lane that is expected k times is chosen k times, rounded up or down.
 

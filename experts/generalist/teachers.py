@@ -50,7 +50,7 @@ class TeachersConfig:
 
     @property
     def searches(self) -> bool:
-        """Whether a search follows where there is no expert, or where it fails."""
+        """Whether a search follows if there is no expert or it fails."""
         return bool(self.witness + self.random + self.learner)
 
 
@@ -136,7 +136,7 @@ def label_states(
     asked: Asked, known: KnownExperts, learner: Any, network: NetworkConfig, config: TeachersConfig,
     key: Key[Array, ""], rules: TaskParams,
 ) -> Labels:  # fmt: skip
-    """Ask the teachers about states: the experts first, a search where they fail; keep what replays to the goal.
+    """Ask the teachers about states: the experts first, a search if they fail; keep what replays to the goal.
 
     Args:
         asked: the states, on the host.

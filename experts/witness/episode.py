@@ -33,7 +33,7 @@ from levelproof.physics.types import Manifold
 # that in many lanes, and in few lanes a step of the engine costs more per lane.
 FEW_LANES, MANY_LANES = 16, 128
 FEW, MANY = 64, 512  # episodes: up to FEW have a small program; from MANY on there are MANY_LANES
-AT_ONCE = 2 * MANY  # most episodes that are played together
+AT_ONCE = 2 * MANY  # maximum number of episodes played together
 STEPS = 256  # maximum env steps per lane in one call of a program
 STEPS_WITH_STATES = 128  # a state of l has 2 kB, with its contacts 6 kB
 STEPS_WITH_PIXELS = 8  # an image has 188 kB

@@ -45,7 +45,7 @@ class Distribution:
 
     # Free bodies
     opposite_sides_chance: float = 0.5  # chance that green starts left and blue right [goal_body_opposide_side_chance]
-    fixed_chance: float = 0.02  # chance that a body of mass 0 is fixed; of a heavier one: higher [fixate_chance_min]
+    fixed_chance: float = 0.02  # chance that a body is fixed at mass 0; grows with mass [fixate_chance_min]
     fixed_chance_per_mass: float = 4.0  # 1/kg; this times the mass is added to fixed_chance [fixate_chance_scale]
     max_fixed_chance: float = 1.0  # upper bound on the chance that a body is fixed [fixate_chance_max]
     lowered_chance: float = 0.0  # chance that a fixed body in the upper half is lowered [fixate_shape_bottom_bias]

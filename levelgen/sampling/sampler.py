@@ -47,7 +47,7 @@ def sample_levels(level_ids: ArrayLike, size: Size | str, distribution: Distribu
 
     Raises:
         ValueError: the size's name is unknown, or it has no room for the scenery, a green and a blue body; the ids are
-            no list of integers, or one is not 0 .. MAX_LEVEL_ID; or `jax_enable_x64` is on.
+            not a list of integers, or one is not 0 .. MAX_LEVEL_ID; or `jax_enable_x64` is on.
     """
     require_32_bits()
     size = size_of(size)

@@ -83,7 +83,7 @@ def _equation(b: ir.IRBuilder, equation: core.JaxprEqn, operands: list) -> list:
     name, params = equation.primitive.name, equation.params
     out: Any = equation.outvars[0].aval if equation.outvars else None
     if name == "round" and params["rounding_method"] != RoundingMethod.TO_NEAREST_EVEN:
-        raise NotImplementedError("a kernel rounds halves to even")
+        raise NotImplementedError("a kernel only rounds halves to even")
     if name in primitives.ELEMENTWISE:
         return [primitives.elementwise(b, name, operands, str(out.dtype))]
     if name in CONTROL:
@@ -197,7 +197,7 @@ def _swap(b: ir.IRBuilder, params: dict, operands: list) -> Value:
     shape, address = _rows(axes)
     x = primitives.with_lanes(b, operands[1]) if memory.lanes else operands[1]
     if x.lanes != memory.lanes:
-        raise NotImplementedError(f"a kernel writes arrays without lanes element by element, not {LANES} at once")
+        raise NotImplementedError(f"a kernel writes arrays without lanes only element by element, not {LANES} at once")
     rows = np.broadcast_to(x.rows, shape)
     for at in np.ndindex(*shape):
         _store(b, memory, address(at), rows[at])

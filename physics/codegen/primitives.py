@@ -74,7 +74,7 @@ def _shift(name: str) -> dict[str, Emit]:
 
     def emit(b, x, y):
         if not isinstance(y, ir.Constant) or not 0 <= y.constant < 32:
-            raise NotImplementedError("a kernel shifts by a constant from 0 to 31")
+            raise NotImplementedError("a kernel only shifts by a constant from 0 to 31")
         return getattr(b, name)(x, y)
 
     return {INT: emit}

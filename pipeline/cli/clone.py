@@ -29,7 +29,7 @@ def run(arguments: argparse.Namespace) -> None:
     splits, settings = parted(arguments.words)
     splits = list(dict.fromkeys(splits))
     if not splits:
-        raise UserError("There is no split to clone: name one, as in `levelproof clone data/128k/s`.")
+        raise UserError("No split was given: name one, as in `levelproof clone data/128k/s`.")
     for split in splits:
         require_known(split)
     clone(splits, compose_clone(settings), arguments.out, Console(stderr=True))

@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--where", metavar="SQL", help="use only levels of the split that meet this condition")
     size = "sizes of sealed levels (default: s) or of the reference's (default: s m l)"
     parser.add_argument("--size", nargs="+", help=size)
-    parser.add_argument("--levels", type=int, metavar="COUNT", help="use only the first levels of each size")
+    parser.add_argument("--levels", type=int, metavar="COUNT", help="use only the first COUNT levels of each size")
     attempts = "attempts at each level (default: 8; on the reference's levels, as many as the reference makes)"
     parser.add_argument("--attempts", type=int, metavar="COUNT", help=attempts)
     parser.add_argument("--seed", type=int, default=0, help="seed of the attempts (default: 0)")

@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("level_id", type=int, nargs="?", metavar="LEVEL_ID", help="id of a level of the split")
     parser.add_argument("--size", help="size of an empty level (default: m)")
     parser.add_argument("--budget", default="256k", help="env steps of an expert (default: 256k)")
-    policy = "folder of a policy that the page lets play (default: builtin:s, which comes with levelproof)"
+    policy = "policy that plays on request: a folder, builtin:s or builtin:m (default: builtin:s)"
     parser.add_argument("--policy", type=Path, default=Path("builtin:s"), metavar="POLICY", help=policy)
     parser.add_argument("--port", type=int, default=8777, help="port to listen on; 0: any (default: 8777)")
     parser.add_argument("--no-browser", action="store_true", help="do not open the page")

@@ -48,6 +48,6 @@ def _split_in(words: list[str]) -> tuple[Path, list[str]]:
     if len(splits) > 1:
         raise UserError(f"Verify one split at a time: name one, not {len(splits)}.")
     if not splits:
-        raise UserError("There is no split to verify: name one, as in `levelproof verify data/128k/s`.")
+        raise UserError("No split was given: name one, as in `levelproof verify data/128k/s`.")
     require_known(splits[0])
     return splits[0], settings

@@ -11,7 +11,7 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.runtime import own_cores
 
 RENAMED = {"batch": "batch_size", "part": "subset"}  # old names in states saved by the previous version
-FINISHED = 2  # most batches that are finished ahead of the caller: the next one, and the one after it
+FINISHED = 2  # maximum number of batches finished ahead of the caller: the next and the one after
 T = TypeVar("T")
 
 

@@ -70,8 +70,8 @@ def add_levels(seed: Path, folder: Path, out: Path) -> None:
     if lacking:
         first = f"level {lacking[0]['level_id']} ({lacking[0]['file']})"
         raise UserError(
-            f"{folder} has no file of {many(len(lacking), 'level')} of the {table.num_rows} of {as_typed(seed)}, "
-            f"{first} among them: set --levels to the folder of the files that were labelled."
+            f"{folder} lacks the files of {len(lacking):,} of the {table.num_rows} levels of {as_typed(seed)}, such as "
+            f"{first}: set --levels to the folder of the files that were labelled."
         )
     with writing_to(out):
         data = seed_bytes(_groups(about, table, found), about.fragment.config, about.budget)
@@ -106,8 +106,8 @@ def _groups(
         hashes = [one.content_hash for one in levels]
         if content_digest(hashes) != about.content[number]:
             raise Failure(
-                f"The level files have other levels than {about.fragment.path} was written from, though with the same "
-                "ids: use the files that were labelled."
+                f"The levels in these files differ from those that {about.fragment.path} was written from, although "
+                "their ids match: use the files that were labelled."
             )
         columns = {name: rows.column(name) for name in SCHEMA.names}
         columns["content"] = pa.array([pack_worlds(one.level)[0] for one in levels], pa.binary())

@@ -22,7 +22,7 @@ class WorkerActor:
     def begin(
         self, program: Program, job: JobConfig, split: Path, neighbours: int, writer: str
     ) -> str | tuple[int, int]:
-        """Set the worker up (see `own_core`, `leases.serve`); return why not if the driver has another program.
+        """Set the worker up (see `own_core`, `leases.serve`), or say how its program differs from the driver's.
 
         If the worker can share compiling with neighbours, it returns as `compile_next` does.
         """

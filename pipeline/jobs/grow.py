@@ -60,7 +60,7 @@ def grow(source: Path, out: Path, settings: Sequence[str], console: Console) -> 
 
 
 def _require_levels(source: Path, config: dict) -> None:
-    """Refuse seed files that were written without their levels, before anything else is.
+    """Refuse seed files that lack their levels, before any other check.
 
     Raises:
         UserError: a file lacks levels.

@@ -66,12 +66,12 @@ def _chosen(source: Path, where: str | None) -> tuple[Mapping[str, Any], list[in
     config = manifest.config or {}
     if not from_files(config) and config["sampler_version"] != SAMPLER_VERSION:
         raise UserError(
-            f"The levels of {source} are of sampler version {config['sampler_version']}, and this program makes those "
-            f"of version {SAMPLER_VERSION}: use the levelproof that made them."
+            f"The levels of {source} come from sampler version {config['sampler_version']}, but this levelproof has "
+            f"version {SAMPLER_VERSION}: use the levelproof that made them."
         )
     level_ids = select(manifest.table, where).column("level_id").to_pylist()
     if not level_ids:
-        raise UserError(f"The condition {where!r} holds for none of the {len(manifest.level_ids)} levels.")
+        raise UserError(f"No level of {source} meets the condition {where!r}: choose others with where.")
     return config, level_ids, origins_of(source, level_ids) if from_files(config) else None
 
 

@@ -97,8 +97,7 @@ def _require_as_examined(split: Path, findings: Findings) -> None:
     """Raise Failure if the split, now locked, has other fragments than when it was examined."""
     if fragment_files(split) != findings.examined:
         raise Failure(
-            f"Another command has changed {split} since it was examined: run the same command again, and no other one "
-            "beside it."
+            f"Another command has changed {split} since it was examined: once it has ended, run this one again."
         )
 
 
@@ -160,7 +159,7 @@ def _not_regenerated(findings: Findings) -> list[str]:
 
 
 def _note(split: Path, job: JobConfig, findings: Findings) -> None:
-    """Note the lost levels as ordered before any data is deleted, so that a later run makes them."""
+    """Add the lost levels to the note before deleting any data, so that a later run makes them."""
     note = sound_note(split)
     wanted = note.level_ids.tolist() if note else findings.present
     note_job(split, job, _command(split), merged(wanted, runs(sorted(findings.lost))))

@@ -153,7 +153,7 @@ def train(
     before, pace = metrics.last.get("bc/core_seconds", 0.0), Pace()
     feed, total = Feed(sources, config), sum(len(source.train) for source in sources)
     if feed.used < total:
-        text = f"Learns from {feed.used:,} of {total:,} levels: raise pool or train.updates, or lower refresh, for all."
+        text = f"Only {feed.used:,} of {total:,} levels are used: raise pool or train.updates, or lower refresh."
         say(console, text)
     with ProgressBar("levels read", feed.levels, console) as bar:
         batches = feed.batches(first, feed.read(first, bar.advance))

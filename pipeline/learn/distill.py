@@ -137,7 +137,7 @@ def levels_for(split: Path, config: DistillConfig, tell: Callable[[str], None]) 
         raise UserError(f"{split} has only trivial levels that meet the condition: choose others with where.")
     chosen = np.flatnonzero(usable & ~trivial)
     if len(chosen) > config.pool:
-        tell(f"Learns from {config.pool:,} of {len(chosen):,} levels of {split} (pool), drawn for the whole run.")
+        tell(f"Only {config.pool:,} of {len(chosen):,} levels of {split} are used, drawn once: raise pool for more.")
         chosen = np.sort(np.random.default_rng(config.seed).choice(chosen, config.pool, replace=False))
     facts = {
         "split": str(split),
@@ -149,7 +149,7 @@ def levels_for(split: Path, config: DistillConfig, tell: Callable[[str], None]) 
     if config.demonstrations or (config.states and config.teachers.expert):
         experts = experts_of(split, ids[chosen])
     if config.demonstrations:
-        tell(f"{int((experts.expert >= 0).sum()):,} of {len(chosen):,} levels have a kept expert")
+        tell(f"{int((experts.expert >= 0).sum()):,} of {len(chosen):,} levels have a kept expert.")
     if not experts.config and (config.demonstrations or not config.teachers.searches):
         only = "demonstrations need them" if config.demonstrations else "no other teacher is asked"
         remedy = "demonstrations=0 and states above 0" if config.demonstrations else "teachers.random above 0"

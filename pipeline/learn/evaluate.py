@@ -191,9 +191,9 @@ def _contestant(path: Path, title: str) -> _Contestant:
 def _log(one: _Contestant, looked_at: Sequence[dict[str, Any]], attempts: int, seed: int, console: Console) -> None:
     """Log a look at sealed levels beside the policy, and tell the user."""
     if looks := log_look(one.looks, one.main, looked_at, attempts, seed):
-        say(console, f"This is look {looks} at the sealed levels with this policy: {one.looks} lists them all.")
+        say(console, f"Evaluation {looks} of this policy on sealed levels: {one.looks} lists them all.")
     elif not str(one.path).startswith(BUILTIN):  # those that come with levelproof were chosen before this look
-        say(console, f"Cannot write {one.looks}, so this look at the sealed levels is not recorded.")
+        say(console, f"Cannot write {one.looks}, so this evaluation is not recorded.")
 
 
 def _own_experts(group: MeasuredLevels, on: str, splits: Sequence[Path], attempts: int) -> list[Specialists]:

@@ -73,9 +73,7 @@ def require_same_run(out: Path, note: dict[str, Any], free: Sequence[str] = ()) 
             if name.startswith("settings.") or name == "cores"
         }
         what = changes_text(named) or "the levels or the start differ"  # which digests would not explain
-        raise UserError(
-            f"{out} has a run with other settings or levels ({what}): repeat its command, or choose another -o."
-        )
+        raise UserError(f"{out} has a run with other settings or levels ({what}): repeat its command, or change -o.")
 
 
 def with_stack(out: Path, note: dict[str, Any], tell: Callable[[str], None]) -> dict[str, Any]:
@@ -139,14 +137,14 @@ def continued(out: Path, fresh: T) -> T:
         return unnamed(fresh, load(read_regular(out / CHECKPOINT)))
     except FileNotFoundError:
         if (out / CONFIG).exists():
-            raise UserError(f"{out} has a policy, but no {CHECKPOINT}: put it back, or choose another -o.") from None
+            raise UserError(f"{out} has a policy, but no {CHECKPOINT}: put it back, or change -o.") from None
         return fresh
     except NotRegular:
         raise
     except OSError as error:
         raise Failure(f"Cannot read {out / CHECKPOINT} ({error.strerror or error}): make it readable.") from None
     except (LookupError, TypeError, ValueError, SafetensorError) as error:
-        raise Failure(f"The checkpoint in {out} is damaged ({error}): start again with another -o.") from None
+        raise Failure(f"The checkpoint in {out} is damaged ({error}): start over in a new folder.") from None
 
 
 def settings_without(config: Any, names: Sequence[str]) -> dict[str, Any]:
@@ -168,7 +166,7 @@ def require_finite(loss: float, setting: str) -> None:
     """Raise Failure if a loss is not finite, so that diverged weights do not replace the checkpoint."""
     if not math.isfinite(loss):
         raise Failure(
-            f"The loss is {loss}, so the weights have diverged: start again with a smaller {setting} and another -o "
+            f"The loss is {loss}, so the weights have diverged: start over with a smaller {setting} in a new folder "
             "(no checkpoint was overwritten)."
         )
 
@@ -192,7 +190,7 @@ def keep_run(out: Path, policy: Policy, state: Any) -> None:
     """
     if not all(np.isfinite(x).all() for x in jax.tree.leaves(policy.params)):
         raise Failure(
-            "The weights have diverged: start again with a smaller learning rate and another -o (no checkpoint was "
+            "The weights have diverged: start over with a smaller learning rate in a new folder (no checkpoint was "
             "overwritten)."
         )
     write(out / CHECKPOINT, save(named(state)), durable=True)

@@ -73,7 +73,7 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
     start = policy_at(Path(config.start)) if config.start else None
     if start:
         require_size(start, source.levels.size, source.name, "start from one that plays any size")
-        tell(f"{config.start} learns from {source.name}.")
+        tell(f"Trains {config.start} on {source.name}.")
     recipe = recipe_of(config, source, start, cores)
     note = note_of(config, source, cores)
     params = None if start is None else start.params

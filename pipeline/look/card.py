@@ -90,7 +90,7 @@ def card(splits: Sequence[Path], out: Path | None, options: CardOptions) -> None
     if remote:
         print(f"Next:  copy them to {as_typed(root)}")
         return
-    excluded = '--exclude "*.lock" --exclude "*/job.json" --exclude "*/events/*" --exclude "*/.*"'
+    excluded = '--exclude "*.lock" --exclude "*/events/*" --exclude "*/.*"'
     print(f"Next:  hf upload {options.repo or 'USER/NAME'} {shlex.quote(str(folder))} . --repo-type dataset {excluded}")
 
 

@@ -164,7 +164,7 @@ def _print(facts: dict[str, Any], console: Console) -> None:
     shares = [f"{side['solved'] / side['tried']:.1%}" if side["tried"] else "-" for side in facts["solved"]]
     gained = facts["only"][1] - facts["only"][0]
     table.add_row("levels solved", *(f"{side['solved']:,}" for side in facts["solved"]), f"{gained:+,}")
-    table.add_row("of undecided levels", *shares, f"p {_p(facts['p'])}")
+    table.add_row("share of undecided levels", *shares, f"p {_p(facts['p'])}")
     table.add_row("solved by this split only", *(f"{count:,}" for count in facts["only"]), "")
     for name in SPENT if all(facts["env_steps"]) else ():
         here, there = (side[name] for side in facts["env_steps"])

@@ -105,7 +105,7 @@ def _training(facts: Mapping[str, Any]) -> str | None:
     steps, after, unsolved = (facts[f"env_steps{suffix}"] for suffix in ("", "_after_success", "_unsolved"))
     if not steps:
         return None if steps is None else "0"
-    return f"{steps:,} ({after / steps:.0%} after a first success, {unsolved / steps:.0%} of levels unsolved)"
+    return f"{steps:,} ({after / steps:.0%} after a first success, {unsolved / steps:.0%} on unsolved levels)"
 
 
 def _list(quantiles: Mapping[str, float] | None) -> str | None:

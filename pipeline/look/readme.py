@@ -144,7 +144,7 @@ or start an environment from it."""
 
 def _sizes(splits: Sequence[SplitFacts]) -> str:
     head = ("split", "levels tried", "distinct levels", "with a witness", "transitions", "size on disk")
-    rows = [f"| {' | '.join(head)} | bytes a transition |", "|---" * (len(head) + 1) + "|"]
+    rows = [f"| {' | '.join(head)} | bytes per transition |", "|---" * (len(head) + 1) + "|"]
     for split in splits:
         each = f"{split.shard_bytes / split.transitions:.1f}" if split.transitions else "-"
         counts = (split.levels, split.distinct, split.witnesses, split.transitions)
@@ -214,7 +214,7 @@ Columns and fields: {_link("docs/columns.md", options.code, "/blob/main/docs/col
 
 
 def _making(splits: Sequence[SplitFacts]) -> str:
-    rows = ["| split | budget | levels are | configuration | stored as | made with |", "|---" * 6 + "|"]
+    rows = ["| split | budget | origin | configuration | stored as | made with |", "|---" * 6 + "|"]
     for split in splits:
         cells = f"{split.budget} | {split.distribution} | `{split.config_hash}` | `{split.stored_as}`"
         rows.append(f"| `{split.path}` | {cells} | {'; '.join(split.made_with)} |")

@@ -26,7 +26,7 @@ from levelproof.pipeline.runtime import prepare_jax
 def play(
     source: Path | None, level_id: int | None, size: str | None, budget: str, port: int, browser: bool, policy: Path
 ) -> None:
-    """Serve the page until Ctrl-C, and open it if `browser`; the page lets the policy in the folder `policy` play.
+    """Serve the page until Ctrl-C, and open it if `browser`; `policy` is the policy that plays on request.
 
     Raises:
         UserError: no such level, size, budget or policy, the file cannot be read or its env steps take too long, or the

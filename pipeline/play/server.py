@@ -52,7 +52,7 @@ def serving(
         procedure: how levels are labelled.
         budget: env steps an expert may use.
         port: number; 0: any free port.
-        contender: the policy that pages let play, or None.
+        contender: policy that plays on request, or None.
 
     Raises:
         UserError: the port is taken or invalid.

@@ -35,7 +35,7 @@ class Session:
     """State of one page's level; answers the requests named in `REQUESTS` with JSON types."""
 
     def __init__(self, file: LevelFile, actions: np.ndarray | None = None, contender: Contender | None = None) -> None:
-        """`actions`, [step, 6], are the level's witness, or None; `contender` is the policy that the page lets play."""
+        """`actions`, [step, 6], are the level's witness, or None; `contender` is the policy that plays on request."""
         self._take(file)
         self._witness = actions
         self._contender, self._attempts = contender, 0

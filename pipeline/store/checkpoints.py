@@ -117,7 +117,7 @@ def begun_like(job: JobConfig) -> ExpertState:
 
 
 def require_plain(file: Path | IO[bytes], size: int) -> None:
-    """Raise ValueError if an archive is compressed or declares more than its `size` bytes; this program writes none."""
+    """Raise ValueError if an archive is compressed or declares more than `size` bytes, as experts never do."""
     with ZipFile(file) as archive:
         parts = archive.infolist()
     if any(part.compress_type != ZIP_STORED for part in parts) or sum(part.file_size for part in parts) > size:

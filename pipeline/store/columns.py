@@ -121,7 +121,7 @@ DESCRIBED = (
     ManifestColumn(
         "portability",
         pa.float32(),
-        "Replays of the witness from perturbed starts that reach the goal",
+        "Witness replays from starts differing by rounding that reach the goal",
         "share",
         f"{NO_WITNESS}, or `expert.replays=0`",
     ),
@@ -191,7 +191,7 @@ DESCRIBED = (
     ManifestColumn(
         "seconds",
         pa.struct([pa.field(stage, pa.float32()) for stage in Seconds._fields]),
-        "Time that the level cost, of a core, or of a GPU if `device` is one: sampling (and labels without an expert), "
+        "Seconds of a core (of a GPU if `device` is one) for the level: sampling (and labels without an expert), "
         "search, training, evaluation, idle slots, replay of witnesses, writing, compiling; by the clock, so other "
         "work on the core makes it longer",
         "s",
@@ -237,7 +237,7 @@ def completed(table: pa.Table, requested: Sequence[str]) -> pa.Table:
 
 
 def with_current_names(text: str) -> str:
-    """Replace names of columns in the last version, in SQL or alone, by today's; warns of each."""
+    """Replace the previous version's column names, in SQL or alone, by today's; warn of each."""
     for old, new in RENAMED.items():
         text, found = re.subn(rf"\b{old}\b", new, text, flags=re.IGNORECASE)
         if found:

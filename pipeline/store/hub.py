@@ -92,7 +92,7 @@ def _page(url: str) -> tuple[dict[str, tuple[str, int]], str]:
                     f"There is no dataset at {url}, or you may not read it: check the URL, and set HF_TOKEN if needed."
                 ) from None
             if error.code not in (408, 429) and error.code < 500:
-                raise StoreFailure(f"The hub refuses {url} ({error.code} {error.reason}): check the URL.") from None
+                raise StoreFailure(f"The hub rejects {url} ({error.code} {error.reason}): check the URL.") from None
             reason = str(error.code)
         except (OSError, HTTPException, ValueError, RecursionError) as error:
             reason = str(getattr(error, "reason", error))

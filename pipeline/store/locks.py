@@ -67,7 +67,7 @@ def only_trainer(folder: Path) -> Iterator[Callable[[], None]]:
                 f"The file system of {folder} has no locks: choose a folder on another one with -o."
             ) from None
         if not taken:
-            raise UserError(f"Another command is writing a policy to {folder}: wait for it, or choose another -o.")
+            raise UserError(f"Another command is writing a policy to {folder}: wait for it, or change -o.")
 
         def require_ours() -> None:
             try:

@@ -146,8 +146,8 @@ class Manifest:
     split: Path
     fragments: tuple[Fragment, ...]  # all that were read
     table: pa.Table
-    named: Mapping[str, frozenset[str]]  # by column (shard, experts), if read: paths that counting fragments name
-    superseded: tuple[Fragment, ...] = ()  # not counting: other fragments have all of their levels
+    named: Mapping[str, frozenset[str]]  # by column (shard, experts), if read: paths that this table's fragments name
+    superseded: tuple[Fragment, ...] = ()  # no rows in the table: other fragments have all their levels
 
     @property
     def counting(self) -> list[Fragment]:
@@ -375,7 +375,7 @@ def _nothing_at(split: Path) -> str:
     require_known(split)
     refuse_folder_of_splits(split)
     if not is_remote(split) and (split / JOB).exists():
-        return f"Nothing is committed in {split} yet: `levelproof status {split}` shows how far its job is."
+        return f"Nothing is committed in {split} yet: `levelproof status {split}` shows its progress."
     what = f"Nothing is committed in {split} yet" if split.is_dir() else f"There is no split at {split}"
     return f"{what}: give a folder such as data/128k/s that `levelproof generate` made."
 

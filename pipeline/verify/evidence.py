@@ -204,12 +204,12 @@ class Evidence:
         differs, steps = unlike_fields(record, replayed), steps_to_goal(done)
         labels, claimed = (np.array(self.columns[name], object)[lanes] for name in ("label", "steps_to_goal"))
         self.findings.witnesses += len(lanes)
-        unlike, restored_otherwise = np.isin(np.arange(len(lanes)), list(differs)), self._restores_otherwise(lanes)
-        self.findings.same_bits += int((~unlike & ~restored_otherwise).sum())
+        unlike, restored_differently = np.isin(np.arange(len(lanes)), list(differs)), self._restores_differently(lanes)
+        self.findings.same_bits += int((~unlike & ~restored_differently).sum())
         report = partial(self._report, lanes=lanes)
         report(unlike & self.portable[lanes], lambda i: f"has a witness that does not replay: its {differs[i]} differs")
         report(
-            restored_otherwise & self.portable[lanes],
+            restored_differently & self.portable[lanes],
             lambda _: "has states that differ from its shard's checksums or key frames",
         )
         report(~succeeds(done, replayed.goal), lambda _: "has a witness that does not reach the goal when replayed")
@@ -254,8 +254,8 @@ class Evidence:
             self.reported[i] = True
         return None
 
-    def _restores_otherwise(self, lanes: Lanes) -> Mask:
-        """Return which levels have unstored states that this machine recomputes with other bits than their maker."""
+    def _restores_differently(self, lanes: Lanes) -> Mask:
+        """Return which levels' unstored states this machine recomputes with different bits."""
         wrong = np.zeros(len(lanes), bool)
         names = np.array(self.columns["shard"], object)[lanes]
         for name in dict.fromkeys(names):
@@ -280,7 +280,7 @@ class Evidence:
     def _check_labels(self, levels: Level, known: Mask) -> None:
         """Check labels that need no expert, for levels whose every bit is `known`.
 
-        Of rows of other engines or GPUs only who may be unsolvable: doing nothing may end otherwise there.
+        For other engines or GPUs, checks only unsolvable labels: doing nothing may end differently there.
         """
         verdicts, failed = decide(levels, self.recipe.rules)
         labels, reasons = self.columns["label"], self.columns["label_reason"]

@@ -73,7 +73,7 @@ def test_run_is_never_measured_later_than_planned(tmp_path: Path, monkeypatch: p
     assert planned == {200: [50, 100, 200], 400: [100, 200, 400], 600: [600]}
 
 
-def test_slower_processor_has_more_of_its_seconds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_core_seconds_scale_with_the_pace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Core-seconds are those of PACE: what was searched here at half of it counts half, and training has the rest."""
     limits = []
 

@@ -56,7 +56,7 @@ def test_compose_job_accepts_any_path_as_out(text: str) -> None:
 @pytest.mark.parametrize(
     ("override", "sentence"),
     [
-        ("size=x", "size is .x.: choose one of s, m, l, or write how many polygons"),
+        ("size=x", "size is .x.: choose one of s, m, l, or give the numbers of polygons"),
         ("size=5-2-1-1", "size is 5-2-1-1: write s instead"),
         ("size=4-1-1-1", "size is 4-1-1-1: 4 polygons and 1 circles leave no room"),
         ("size=8-8-0-0", "size is 8-8-0-0: it has no room for the actuators"),

@@ -246,7 +246,7 @@ def centre_inside(fields):
 
 
 def count_states(fields):
-    """How many states show what: evidence that nothing important is missing."""
+    """Count the states that show each feature, as evidence of coverage."""
     before, after = (
         {name.removeprefix(prefix): x for name, x in fields.items() if name.startswith(prefix)}
         for prefix in ("before/", "after/")
@@ -278,7 +278,7 @@ def count_states(fields):
 
 
 def gather(state, result):
-    """The states before and after, and what came with them, without what nobody compares."""
+    """Return the states before and after, and the other results that tests compare."""
     kept = EVOLVING | {"timestep", "last_distance"}
     fields = {f"before/{name}": x for name, x in flatten(state).items() if name not in DERIVED}
     fields |= {f"after/{name}": x for name, x in flatten(result["after"]).items() if name in EVOLVING}

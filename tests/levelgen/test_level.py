@@ -29,7 +29,7 @@ def test_sizes_have_their_canonical_names() -> None:
     "name", ["", "x", "S", "8", "8-8-8", "8-8-8-4-4", "8,8,8,4", "08-8-8-4", "8-8--8-4", "８-8-8-4"]
 )
 def test_size_of_refuses_an_unknown_name(name: str) -> None:
-    with pytest.raises(ValueError, match=rf"^size is '{name}': choose one of s, m, l, or write how many polygons"):
+    with pytest.raises(ValueError, match=rf"^size is '{name}': choose one of s, m, l, or give the numbers of polygons"):
         size_of(name)
 
 

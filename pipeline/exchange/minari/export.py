@@ -68,7 +68,7 @@ def export_minari(split: Path, where: str | None, out: Path, kind: ActionKind = 
                 "author": {f"levelproof {__version__}"},
                 "algorithm_name": "PPO experts of one level each, random play and search; replayed",
                 "description": f"Witnesses of {many(rows.num_rows, 'level')} of size {size}, made with a budget of "
-                f"{budget} env steps a level. infos has success, level_id, and which entries of an action do "
+                f"{budget} env steps per level. infos has success, level_id, and which entries of an action do "
                 "something. " + (f"Six entries of an action: {UNRAVEL}" if kind == ActionKind.COMBINED else ""),
             }
         )

@@ -53,7 +53,7 @@ def test_discount_counts_env_steps_whatever_an_action_lasts() -> None:
 
 
 @pytest.mark.parametrize("repeat", [1, 3])
-def test_repeated_action_does_what_as_many_env_steps_do(repeat: int) -> None:
+def test_repeated_action_equals_that_many_env_steps(repeat: int) -> None:
     """The same world, and the same reward after the first action, whose shaping is 0; the same lanes end."""
     config = PPOConfig(repeat=repeat, dense_reward_scale=0.3)
     once, whole = config.training_rules(DEFAULT_RULES), replace(config, repeat=1).training_rules(DEFAULT_RULES)
@@ -85,7 +85,7 @@ def test_cores_normalise_the_samples_that_count_together() -> None:
     assert not parts[:, 3].any()
 
 
-def test_a_weight_counts_a_sample_as_often() -> None:
+def test_weight_n_equals_n_copies() -> None:
     keys = jax.random.split(jax.random.key(0), 6)
     times = jnp.array([0, 1, 2, 3, 2])
     logits, before, gain = (
@@ -163,7 +163,7 @@ def test_learnability_keeps_levels_that_are_sometimes_solved() -> None:
 
 
 def test_learnability_adds_up_the_attempts_at_copies_of_few_levels() -> None:
-    """Level 0 is solved as often as not, but each of its copies either always or never; level 1 a quarter as often."""
+    """Half of the copies of level 0 are always solved, the others never; level 1 is solved a quarter of the time."""
     config = LearnabilityConfig(candidates=64, keep=16)
     table = table_of(sample_levels(np.arange(5), "s"), DEFAULT_RULES)
 

@@ -48,7 +48,7 @@ def test_weighted_means_have_the_expectation_of_all_samples() -> None:
     np.testing.assert_array_less(jnp.abs(means.mean(0) - jnp.where(counts, x, 0).mean(1)), 5 * error)
 
 
-def test_where_nothing_counts_nothing_weighs() -> None:
+def test_weights_are_0_if_no_sample_counts() -> None:
     gain, counts, _ = drawn(2)
     _, weight = choose(gain, counts.at[3].set(False), LANES, jax.random.key(0))
     assert not weight[3].any()

@@ -215,7 +215,7 @@ def test_variation_has_at_least_one_change() -> None:
 
 
 def test_nearest_of_takes_the_trajectories_to_the_nearest_entries() -> None:
-    """Not those to unused entries or broken states; each repeats its last action, the start its first."""
+    """Unused entries and broken states are omitted; each repeats its last action, the start its first."""
     count = NEAREST
     steps, distance, nothing = np.zeros((1, count), int), np.full((1, count), FAR, np.float32), np.zeros((1, count))
     steps[0, :4], distance[0, :4] = [3, 5, 2, 0], [0.4, 0.1, np.nan, 0.2]

@@ -174,7 +174,7 @@ def test_continued_expert_equals_one_trained_without_a_break(levels: Level, stop
 
 
 def test_expert_keeps_an_earlier_success(levels: Level, whole: list[TrainedLevel]) -> None:
-    """Training replaces it by none of its own; levels without one train as if nobody had searched."""
+    """Training keeps the search's success; levels without one train as they do without a search."""
     findings = nothing_found(len(IDS))._replace(success=random_successes(levels, IDS))
     trained, _ = train(levels, IDS, 2, CONFIG, WHOLE, found=findings)
     assert 0 < (findings.success.length > 0).sum() < len(IDS)

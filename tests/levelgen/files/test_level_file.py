@@ -90,7 +90,7 @@ def test_smallest_and_largest_sizes_fit_into_a_file(size: Size, tmp_path: Path) 
     assert read_level_file(tmp_path / "level.json").level.size == size
 
 
-def test_level_file_is_written_to_a_path_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_write_level_file_accepts_a_string_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     write_level_file(LevelFile(empty_level(SIZES["s"], 1), TaskParams()), "level.json")
     assert read_level_file("level.json").level.size == SIZES["s"]

@@ -120,7 +120,7 @@ def test_invalid_command_prints_the_usage(capsys: pytest.CaptureFixture[str], ar
         (["show", "x", "-o", "y.svg", "9" * 5000], "There is no argument 9999"),
         (["inspect", "x" * 300], f"Cannot use {'x' * 200}... (File name too long): check the path"),
         (["sample", "level_files=x"], "sample draws random levels"),
-        (["verify", "--repair"], "There is no split to verify"),
+        (["verify", "--repair"], "No split was given"),
         (["verify", "--repair", "executor=inline", "x"], "There is no split at x"),
         (["verify", "--repair", "x", "y"], "Verify one split at a time: name one, not 2"),
         (["inspect", "x", "--csv", "--against", "y"], "--against has no effect with --csv: leave one of them out"),

@@ -251,7 +251,7 @@ def test_open_read_and_state_reject_invalid_arguments(split: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize("read", ["read", "levels", "episodes", "state"])
-def test_masks_and_fractions_are_no_indices(data: Dataset, read: str) -> None:
+def test_masks_and_fractions_are_not_indices(data: Dataset, read: str) -> None:
     """They would read the trajectories 0 and 1 again and again."""
     with pytest.raises(UserError, match=r"must be integers, not of the type bool: pass np\.flatnonzero\(mask\)"):
         getattr(data, read)(np.arange(len(data)) % 2 == 0)

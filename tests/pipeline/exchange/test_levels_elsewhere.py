@@ -112,7 +112,7 @@ def test_levels_are_added_again_from_files_of_any_name(
     assert not examine(grown).wrong, "levels without a witness are read from their files"
 
 
-def test_file_that_the_witness_solves_is_taken_of_those_with_the_same_level(
+def test_add_levels_takes_the_copy_that_the_witness_solves(
     whole: Path, lacking: Path, folder: Path, tmp_path: Path
 ) -> None:
     """Content hashes do not depend on the order of bodies, and what a witness does may."""
@@ -174,7 +174,7 @@ def test_handmade_means_those_of_the_reference_and_a_path_means_a_folder(
     Path("handmade").mkdir()
     words = ["export", str(lacking), "--format", "seed", "-o", "whole.parquet", "--levels"]
     assert main([*words, "./handmade"]) == 2
-    assert "handmade has no file of 16 levels" in capsys.readouterr().err
+    assert "handmade lacks the files of 16 of the " in capsys.readouterr().err
     assert main([*words, "handmade"]) == 0
 
 
@@ -202,7 +202,7 @@ def test_other_levels_with_the_same_ids_are_refused(whole: Path, folder: Path, t
     table = table.set_column(table.column_names.index("content"), "content", pa.nulls(COUNT, pa.binary()))
     other = tmp_path / "other.parquet"
     other.write_bytes(seed_bytes([(table, ["c1:0"] * COUNT)], read_manifest(whole, []).config or {}, "128k"))
-    with pytest.raises(Failure, match="other levels than"):
+    with pytest.raises(Failure, match="The levels in these files differ from those"):
         add_levels(other, folder, tmp_path / "again.parquet")
 
 

@@ -181,7 +181,7 @@ def test_import_continues_after_a_stop(
     assert [[row[name] for name in same] for row in got] == [[row[name] for name in same] for row in want]
 
 
-def test_import_that_is_gone_is_named(folder: Path) -> None:
+def test_regenerate_names_a_missing_folder(folder: Path) -> None:
     moved = folder / "moved"
     shutil.copytree(folder, moved)
     words = ["regenerate", "manifest=moved/data/1M/s", "budget=5k", "executor=inline", "where=label = 'unsolved'"]

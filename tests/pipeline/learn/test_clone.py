@@ -201,7 +201,7 @@ def test_levels_that_no_update_draws_from_are_counted(split: Path, updates: int,
 
 
 def test_bad_input_is_refused(split: Path, policy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert_refused(here(["clone", "train.updates=3"], tmp_path), 2, "no split to clone")
+    assert_refused(here(["clone", "train.updates=3"], tmp_path), 2, "No split was given")
     assert_refused(here(["clone", str(split), "train.update=3"], tmp_path), 2, "did you mean train.updates?")
     assert_refused(here(["clone", str(split), "network.width=6"], tmp_path), 2, "multiple of heads")
     assert_refused(here(["clone", str(split), "-o", str(policy)], tmp_path), 2, "other settings or levels")
@@ -279,7 +279,7 @@ def test_second_clone_is_refused_where_one_runs(split: Path, tmp_path: Path) -> 
     assert not (tmp_path / "policy" / "run.json").exists()
 
 
-def test_clone_writes_nothing_to_a_folder_that_was_made_again(
+def test_clone_writes_nothing_to_a_recreated_folder(
     split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, validated = tmp_path / "policy", module.validated

@@ -239,7 +239,7 @@ def test_levels_are_witnessed_and_neither_trivial_nor_sealed(split: Path, monkey
         assert (witness[first:, :, i] == stored.action[i, first - 1]).all()
     told: list[str] = []
     some = module.levels_for(split, DistillConfig(pool=3), told.append)
-    assert told == [f"Learns from 3 of {len(ids):,} levels of {split} (pool), drawn for the whole run."]
+    assert told == [f"Only 3 of {len(ids):,} levels of {split} are used, drawn once: raise pool for more."]
     few = module.witnessed(some, NetworkConfig(), quiet)
     assert len(few.level_ids) == len(few.levels) == len(few.witnesses.steps) == 3
     monkeypatch.setattr(sealed, "SEALED", range(int(ids[0]), int(ids[0]) + 1))

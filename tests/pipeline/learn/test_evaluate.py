@@ -162,7 +162,7 @@ def test_folder_of_splits_is_named(split: Path, tmp_path: Path) -> None:
         (["nowhere.py"], "There is no agent at nowhere.py"),
     ],
 )
-def test_command_refuses(tmp_path: Path, words: list[str], sentence: str) -> None:
+def test_evaluate_refuses_invalid_arguments(tmp_path: Path, words: list[str], sentence: str) -> None:
     assert_refused(here(["evaluate", *words], tmp_path), 2, sentence)
 
 

@@ -35,7 +35,7 @@ def test_worst_tenth_is_rated_on_other_attempts_than_chose_it() -> None:
 
 
 def test_worst_tenth_has_all_levels_that_tie_with_its_last() -> None:
-    """Of levels that nothing tells apart, which come first does not matter."""
+    """The order of levels that tie does not matter."""
     hopeless = np.zeros((300, 4), bool)
     chosen = np.tile([False, False, True, True], (100, 1))  # not solved by the attempts that choose
     easy = np.ones((600, 4), bool)

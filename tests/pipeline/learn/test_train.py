@@ -290,7 +290,7 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (["start=policy", "ppo.kl_updates=8"], "ppo.kl_updates has no effect without ppo.kl_weight"),
         (
             ["start=policy", "ppo.env_steps=4M"],
-            "ppo.env_steps gives 8 updates, and the first 10 (ppo.critic_updates) leave the policy as it is",
+            "ppo.env_steps gives 8 updates, and the first 10 leave the policy as it is: raise ppo.env_steps",
         ),
         (
             ["levels=learnability", "curriculum.measured_steps=255"],

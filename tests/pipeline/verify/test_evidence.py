@@ -62,7 +62,7 @@ def test_examine_finds_a_label_that_denies_its_shard(split: Path, label: Label, 
 
 
 def test_examine_is_refused_if_fragments_have_different_settings(split: Path) -> None:
-    """Their levels are made or played otherwise, so no recipe holds for all."""
+    """Their levels are made or played differently, so no recipe fits all."""
     path = fragment_paths(split)[-1]
     table = pq.read_table(path)
     metadata = table.schema.metadata or {}

@@ -161,8 +161,8 @@ def test_examine_finds_a_label_that_hides_a_proof(split: Path, label: str, other
     assert_reported(split, *sentences * (label == "unsolvable" or not elsewhere))
 
 
-def test_examine_believes_a_gpu_what_doing_nothing_does_there(split: Path) -> None:
-    """A chaotic idle episode ends otherwise on another engine or GPU."""
+def test_examine_accepts_what_doing_nothing_does_on_a_gpu(split: Path) -> None:
+    """Chaotic idle episodes end differently on another engine or GPU."""
     level_id = rows_labelled(split, Label.SOLVED)[0]["level_id"]
     forge(split, lambda row: row.update(failed_by_noop=not row["failed_by_noop"]), [level_id])
     assert_reported(split, "by doing nothing, but the manifest says otherwise")
@@ -171,7 +171,7 @@ def test_examine_believes_a_gpu_what_doing_nothing_does_there(split: Path) -> No
 
 
 def test_examine_believes_a_witness_rather_than_a_proof(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As of imported actions that solve a level which is wrongly proved unsolvable."""
+    """Such as imported actions that solve a level wrongly proved unsolvable."""
     wrong = untrained(Label.UNSOLVABLE, "wrongly proved", False)
 
     def all_unsolvable(levels: Level, rules: TaskParams) -> PriorVerdicts:
@@ -312,7 +312,9 @@ def test_repair_does_not_act_on_what_has_changed_since(split: Path, monkeypatch:
     damaged.write_bytes(b"PAR1")
     monkeypatch.setattr(repairing, "_examine_split", meanwhile)
     done = here(["verify", str(split), "--repair", "executor=inline"], split.parent)
-    assert_refused(done, 1, f"Another command has changed {split} since it was examined: run the same command again")
+    assert_refused(
+        done, 1, f"Another command has changed {split} since it was examined: once it has ended, run this one again"
+    )
     assert damaged.read_bytes() == whole
     assert not examine(split).wrong
 
