@@ -155,7 +155,7 @@ REFUSED: dict[str, Callable] = {
     "gather": lambda x, n: x[jnp.where(jnp.any(x > 0), jnp.array([1, 2]), 3)],
     "dynamic_slice": lambda x, n: lax.dynamic_slice_in_dim(x, jnp.any(x > 0).astype(int), 2),
     "shifts by a constant": lambda x, n: lax.shift_left(n, jnp.full_like(n, 32)).astype(jnp.float32),
-    "a kernel shifts": lambda x, n: lax.shift_left(n, n).astype(jnp.float32),
+    "only shifts by a constant": lambda x, n: lax.shift_left(n, n).astype(jnp.float32),
     "to the power of -2": lambda x, n: x**-2,
     "dot_general": lambda x, n: jnp.ones((3, 4), jnp.float32) @ x,
     "reduce": lambda x, n: lax.reduce(x, np.float32(0), lambda a, b: a + 2 * b, (0,)),
