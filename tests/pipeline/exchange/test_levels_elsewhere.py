@@ -191,7 +191,7 @@ def test_folder_that_lacks_a_level_is_refused(lacking: Path, folder: Path, tmp_p
     for path in sorted((folder / "some").iterdir())[1:]:
         (tmp_path / "some" / path.name).write_bytes(path.read_bytes())
     for there, count in (tmp_path / "some", 1), (tmp_path / "nothing", COUNT):
-        with pytest.raises(UserError, match=rf"no file of {count} levels? of the {COUNT}"):
+        with pytest.raises(UserError, match=rf"lacks the files of {count} of the {COUNT} levels"):
             add_levels(lacking, there, tmp_path / "again.parquet")
     assert not (tmp_path / "again.parquet").exists()
 
