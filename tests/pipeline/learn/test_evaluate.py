@@ -241,7 +241,7 @@ def test_each_look_at_the_sealed_levels_is_logged(tmp_path: Path) -> None:
     for look in (1, 2):
         done = here(["evaluate", str(policy), "--levels", "4", *ONCE], tmp_path)
         assert done.returncode == 0, done.stderr
-        assert f"look {look} at the sealed levels" in done.stderr
+        assert f"Evaluation {look} of this policy on sealed levels" in done.stderr
     looks = [json.loads(line) for line in (policy / LOOKS).read_text().splitlines()]
     assert [look["on"]["sealed s"]["levels"] for look in looks] == [4, 4]
     assert {look["attempts"] for look in looks} == {1}
