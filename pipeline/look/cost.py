@@ -46,5 +46,5 @@ def describe_cost(cost: dict[str, Any]) -> str:
     """Describe a cost in words, to follow `cost: `."""
     total, each = sum(cost["seconds"].values()), cost["per_solved"]
     shares = ", ".join(f"{part / total:.0%} {stage}" for stage, part in cost["seconds"].items() if total)
-    solved = "" if each is None else f", {number(each)} a solved level"
+    solved = "" if each is None else f", {number(each)} per solved level"
     return f"{total:,.0f} {cost['of']}-seconds ({shares}){solved}"

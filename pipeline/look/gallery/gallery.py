@@ -87,9 +87,19 @@ def gallery(split: Path, out: Path, where: str | None, most: int, policy: Path |
 
 
 def _is_gallery(folder: Path) -> bool:
-    """Return whether a folder is a gallery, and nothing else: as the root of a website it may hold other files."""
+    """Return whether a folder is a gallery.
+
+    Raises:
+        UserError: it is one, but holds other files, too, as the root of a website may.
+    """
+    if not (folder / ABOUT).is_file():
+        return False
     ours = {"data", PALETTE, *(path.name for path in SITE.iterdir())}
-    return (folder / ABOUT).is_file() and {path.name for path in folder.iterdir()} <= ours
+    for name in sorted({path.name for path in folder.iterdir()} - ours):
+        raise UserError(
+            f"{folder} has {name}, which is not part of a gallery: name a new folder with -o, or remove it."
+        )
+    return True
 
 
 def _chosen(split: Path, where: str | None, most: int) -> tuple[Manifest, int]:

@@ -21,7 +21,7 @@ def test_cost_per_solved_level_includes_unsolved_levels() -> None:
     assert (cost["of"], cost["levels"], cost["per_solved"]) == ("core", 3, pytest.approx(6.0))
     assert cost["seconds"] == Seconds(search=4.0, training=7.0, writing=1.0)._asdict()
     assert describe_cost(cost).startswith("12 core-seconds (0% sampling, 33% search, 58% training")
-    assert describe_cost(cost).endswith(", 6 a solved level")
+    assert describe_cost(cost).endswith(", 6 per solved level")
 
 
 def test_cost_omits_what_was_not_measured_or_solved() -> None:

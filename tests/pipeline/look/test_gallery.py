@@ -214,7 +214,7 @@ def test_gallery_replaces_only_galleries(split: Path, tmp_path: Path, monkeypatc
     out.rmdir()
     gallery(split, out, None, 1)
     (out / "CNAME").write_text("mine")  # the root of a website
-    with pytest.raises(UserError, match=r"/.* already exists"):
+    with pytest.raises(UserError, match=r"/.* has CNAME, which is not part of a gallery"):
         gallery(split, out, None, 2)
     assert (out / "CNAME").read_text() == "mine"
     (out / "CNAME").rename(out / "data/old")
