@@ -29,7 +29,7 @@ class EpochOrder:
 
     def __post_init__(self) -> None:
         for name in ("batch_size", "seed", "process_index", "process_count"):
-            object.__setattr__(self, name, plain(getattr(self, name)))
+            object.__setattr__(self, name, as_int(getattr(self, name)))
         if not (type(self.batch_size) is int and self.batch_size > 0):
             raise UserError(f"A batch cannot have {self.batch_size} items: use an integer from 1.")
         process = self.process_index, self.process_count
@@ -64,7 +64,7 @@ class EpochOrder:
         return items.ravel(), ranks.ravel() < self.count
 
 
-def plain(value: Any) -> Any:
+def as_int(value: Any) -> Any:
     """Return an integer of numpy or JAX as Python's, which JSON can hold; other values unchanged."""
     try:
         return operator.index(value)

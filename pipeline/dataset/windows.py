@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from levelproof.experts.config import RECORD_STEPS
-from levelproof.pipeline.dataset.order import plain
+from levelproof.pipeline.dataset.order import as_int
 from levelproof.pipeline.errors import UserError
 
 
@@ -23,7 +23,7 @@ class Windows(NamedTuple):
         Raises:
             UserError: `length` is not an integer from 1 to the steps of a record.
         """
-        length = plain(length)
+        length = as_int(length)
         if length is not None and not (type(length) is int and 0 < length <= RECORD_STEPS):
             raise UserError(f"A window cannot have {length} steps: use 1 to {RECORD_STEPS}, or None for whole records.")
         return Windows(length or RECORD_STEPS)
