@@ -6,6 +6,7 @@ A stopped run resumes: the folder keeps trained networks and finished evaluation
 import argparse
 import json
 import os
+import shlex
 import shutil
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from benchmarks.report import Report, Table
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.learn.evaluate import AGENT, SOLVED
 from levelproof.pipeline.store.files import write
+from levelproof.pipeline.store.job_note import read_note
 
 SCRIPT = Path(__file__).parents[1] / "docs" / "learners" / "offline_torchrl.py"
 METHODS = {  # name: the script's word for it
@@ -64,7 +66,8 @@ def run(args: argparse.Namespace) -> Report:
             "324 combined actions. Conservative Q-learning takes its best action, the others draw theirs. *Flat "
             "network*: an MLP of the same width and depth with an output for each choice of each entry; *levelproof "
             "clone*: the default, attention over entities.",
-            "Core-seconds are CPU time of training, with reading and compiling.",
+            f"Core-seconds are CPU time of training, with reading and compiling. `{made_by(args.split)}` made the "
+            "split.",
         ],
     )
 
@@ -80,6 +83,12 @@ def require_same_data(args: argparse.Namespace) -> None:
         write(file, told.encode())
     if (made := file.read_text()) != told:
         raise UserError(f"{args.folder} was made with {made}, not with {told}: choose another --folder.")
+
+
+def made_by(split: Path) -> str:
+    """Return the command that made a split, without the words that decide nothing about its data."""
+    words = shlex.split(read_note(split).command)
+    return shlex.join(word for word in words if word.partition("=")[0] not in ("out", "executor"))
 
 
 def exported(args: argparse.Namespace) -> str:

@@ -3,7 +3,7 @@
 A batch with fewer lanes than its program is padded with copies of its last lane.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
 import jax
@@ -55,6 +55,11 @@ def take(tree: T, lanes: np.ndarray | slice) -> T:
         return x[..., lanes]
 
     return jax.tree.map(select, tree)
+
+
+def stacked(trees: Iterable[T]) -> T:
+    """Join trees of equal structure, at least one, along a new first axis, on the host."""
+    return jax.tree.map(lambda *xs: np.stack(xs), *trees)
 
 
 def repeat(tree: T, lanes: int) -> T:

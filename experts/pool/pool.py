@@ -34,7 +34,7 @@ from levelproof.experts.verdict.judge import (
     witnesses_in,
 )
 from levelproof.experts.verdict.portability import PORTABLE, choose
-from levelproof.levelgen.batching import at_once
+from levelproof.levelgen.batching import at_once, stacked
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.rules import TaskParams
 
@@ -208,7 +208,7 @@ class Pool:
         """Return slots with new experts, or with those that continue."""
         count = len(entrants)
         success = [jax.tree.map(lambda x, i=i: x[i], submission.found.success) for submission, i, _ in entrants]
-        fresh = begin(levels, level_ids, jax.tree.map(lambda *xs: np.stack(xs), *success), self.config)
+        fresh = begin(levels, level_ids, stacked(success), self.config)
         no = np.zeros(count, bool)
         experts = fresh, Pending(no, no, np.full(count, self.updates, np.int32))
         continued = {row: (submission, i) for row, (submission, i, _) in enumerate(entrants) if i in submission.begun}

@@ -20,7 +20,7 @@ from levelproof.experts.search.play import success_of
 from levelproof.experts.search.shorten import shorten
 from levelproof.experts.search.vary import Varying, nearest_of
 from levelproof.experts.witness.success import Success, no_success
-from levelproof.levelgen.batching import at_once, blocks, take
+from levelproof.levelgen.batching import at_once, blocks, stacked, take
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.programs import jit_sooner
 from levelproof.levelgen.task.rules import TaskParams
@@ -145,8 +145,9 @@ class Searching:
     def _vary(self) -> None:
         """Advance variations of the nearest trajectories."""
         slots, config, rules = self._varying, self._scaled, self._rules
-        stacked = lambda entrants: jax.tree.map(lambda *xs: np.stack(xs), *(entrant.known for entrant in entrants))
-        begin = lambda levels, level_ids, some: vary.begin(levels, level_ids, stacked(some), config.endless)
+        begin = lambda levels, level_ids, some: vary.begin(
+            levels, level_ids, stacked(entrant.known for entrant in some), config.endless
+        )
         advance = lambda rows: vary.vary(rows, config, rules)
         for slot, (job, index, _), result in stepped(slots, begin, advance, partial(varied, ends=config.ends)):
             success, env_steps = result

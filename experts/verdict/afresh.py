@@ -16,7 +16,7 @@ from levelproof.experts.config import RECORD_STEPS, ExpertConfig
 from levelproof.experts.policy import Params, network_of
 from levelproof.experts.training.rollout import Acting, ActionRule, rollout, start
 from levelproof.experts.verdict.portability import IN_CACHE
-from levelproof.levelgen.batching import at_once, blocks, repeat, take
+from levelproof.levelgen.batching import at_once, blocks, repeat, stacked, take
 from levelproof.levelgen.identity.keys import Stream, key_for
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.programs import jit_sooner
@@ -58,7 +58,7 @@ def attempt(
     """
     parts = [AttemptResults(np.zeros(0, np.float32), np.zeros(0, np.int32))]
     for some in blocks(len(level_ids), at_once(config.attempts, IN_CACHE)):
-        params = jax.tree.map(lambda *xs: np.stack(xs), *(policies[i] for i in some))
+        params = stacked(policies[i] for i in some)
         parts.append(jax.device_get(attempt_block(take(levels, some), level_ids[some], params, config, rules)))
     return AttemptResults(*(np.concatenate(column)[: len(level_ids)] for column in zip(*parts, strict=True)))
 

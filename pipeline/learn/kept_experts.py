@@ -3,7 +3,6 @@
 from collections import defaultdict
 from pathlib import Path
 
-import jax
 import numpy as np
 from jaxtyping import Int
 
@@ -11,6 +10,7 @@ from levelproof.configs.convert import typed
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.config import ExpertConfig, StopConfig
 from levelproof.experts.generalist.teachers import KnownExperts, no_experts
+from levelproof.levelgen.batching import stacked
 from levelproof.pipeline.read.levels import recorded_settings
 from levelproof.pipeline.store.checkpoints import load_experts
 from levelproof.pipeline.store.layout import data_path
@@ -51,4 +51,4 @@ def experts_of(split: Path, level_ids: Int[np.ndarray, " level"]) -> KnownExpert
         params |= {i: experts[i].begun.training.train_state.params for i in ids}
     row_of = {level_id: row for row, level_id in enumerate(params)}
     expert = np.array([row_of.get(level_id, -1) for level_id in level_ids.tolist()])
-    return KnownExperts(config, jax.tree.map(lambda *xs: np.stack(xs), *params.values()), expert)
+    return KnownExperts(config, stacked(params.values()), expert)

@@ -17,6 +17,7 @@ from levelproof.experts.labels import BY_EXPERT
 from levelproof.experts.training.slots import ExpertState, begin
 from levelproof.experts.verdict.judge import KeptExpert
 from levelproof.experts.witness.success import no_success
+from levelproof.levelgen.batching import stacked
 from levelproof.levelgen.identity.keys import level_id_array
 from levelproof.levelgen.level import size_of
 from levelproof.levelgen.sampling.scenery import empty_level
@@ -44,7 +45,7 @@ def save_experts(path: Path, experts: Mapping[int, KeptExpert]) -> None:
         OSError: the write fails.
     """
     rows = [experts[level_id] for level_id in sorted(experts)]
-    begun, curves = jax.tree.map(lambda *xs: np.stack(xs), *(row.begun for row in rows)), stacked_curves(rows)
+    begun, curves = stacked(row.begun for row in rows), stacked_curves(rows)
     path.parent.mkdir(mode=0o755, parents=True, exist_ok=True)
     with open(path, "xb", opener=regular) as file:
         np.savez(

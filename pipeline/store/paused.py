@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from zipfile import BadZipFile
 
-import jax
 import numpy as np
 
 from levelproof.configs.schema import JobConfig
@@ -26,6 +25,7 @@ from levelproof.experts.pool.found import nothing_found
 from levelproof.experts.pool.paused import Paused
 from levelproof.experts.training.slots import Pending
 from levelproof.experts.verdict.judge import Evaluation
+from levelproof.levelgen.batching import stacked
 from levelproof.pipeline.errors import Failure, LevelproofError, StoreFailure
 from levelproof.pipeline.owned import require_own
 from levelproof.pipeline.store import objects
@@ -77,14 +77,13 @@ def save_paused(split: Path, unit: str, paused: Mapping[int, Paused], job: JobCo
         LeaseLost: this process works for a writer that no longer has the split; the earlier checkpoint stays.
     """
     rows = [paused[level_id] for level_id in sorted(paused)]
-    stacked = jax.tree.map(lambda *xs: np.stack(xs), *map(_arrays, rows))
-    arrays = arrays_of(stacked, "paused/") | {"level_id": np.array(sorted(paused))}
+    arrays = arrays_of(stacked(map(_arrays, rows)), "paused/") | {"level_id": np.array(sorted(paused))}
     arrays["curve"] = stacked_curves([row.expert for row in rows])
     arrays["source"] = np.array([row.found.source[0] for row in rows])
     if evaluations := [(i, evaluation) for i, row in enumerate(rows) for evaluation in row.evaluations]:
         indices, trees = zip(*evaluations, strict=True)
         arrays["evaluated"] = np.array(indices)
-        arrays |= arrays_of(jax.tree.map(lambda *xs: np.stack(xs), *trees), "evaluation/")
+        arrays |= arrays_of(stacked(trees), "evaluation/")
     file, path = io.BytesIO(), checkpoint_path(split, unit)
     np.savez(file, allow_pickle=False, **arrays)
     if not is_remote(split):
