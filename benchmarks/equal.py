@@ -196,20 +196,22 @@ def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
     elif WAYS[way].own_levels:
         with SEARCHING:
             before = scale * searched(args, seed)
-    ends, looks, curve, rates = [share * args.core_seconds for share in LOOKS], [], [], {}
+    ends, curve, rates = [share * args.core_seconds for share in LOOKS], [], {}
+    look_at = lambda spent: folder.with_name(f"{folder.name}-after-{spent}-{args.measured}.json")
     if before >= ends[-1]:
         raise UserError(f"{way}: what comes before training takes {before:,.0f} core-seconds: raise --core-seconds.")
     for spent in (end for end in ends if end > before):
-        look, so_far = folder.with_name(f"{folder.name}-after-{spent:g}-{args.measured}.json"), lines_of(folder)
+        look, so_far = look_at(f"{spent:g}"), lines_of(folder)
         limit = (spent - before) / scale  # in seconds of this processor
         if spent < ends[-1] and (look.exists() or (so_far and so_far[-1][SECONDS] > limit)):
-            looks += [json.loads(look.read_text())] if look.exists() else []
-            continue  # of a run that was stopped, or had fewer core-seconds
+            continue  # a run that was stopped, or had fewer core-seconds, came that far
         curve = trained(args, folder, way, start, seed, limit)
         rates = kept(args.folder / f"{folder.name}-{curve[-1][STEPS]}-{args.measured}.json", folder, *measuring(args))
         solved = rates[SOLVED][SAMPLED]["once"]
-        looks.append({"planned": spent, SECONDS: before + scale * curve[-1][SECONDS], "solved": solved})
-        write(look, (json.dumps(looks[-1]) + "\n").encode())
+        told = {"planned": spent, SECONDS: before + scale * curve[-1][SECONDS], "solved": solved}
+        write(look, (json.dumps(told) + "\n").encode())
+    looks = [json.loads(look.read_text()) for look in folder.parent.glob(look_at("*").name)]
+    looks = sorted((look for look in looks if look["planned"] <= args.core_seconds), key=lambda look: look["planned"])
     lines = [*curve[:: -(-len(curve) // POINTS)], curve[-1]]
     some = [
         {name: line.get(name) for name in (UPDATES, STEPS, RATE)} | {SECONDS: scale * line[SECONDS]} for line in lines

@@ -70,7 +70,7 @@ def test_run_is_never_measured_later_than_planned(tmp_path: Path, monkeypatch: p
         looks = equal.measured(args, "from scratch", 0)["looks"]
         planned[args.core_seconds] = [look["planned"] for look in looks]
         assert all(look[SECONDS] == look["planned"] - 1 for look in looks)
-    assert planned == {200: [50, 100, 200], 400: [100, 200, 400], 600: [600]}
+    assert planned == {200: [50, 100, 200], 400: [50, 100, 200, 400], 600: [50, 100, 200, 400, 600]}
 
 
 def test_core_seconds_scale_with_the_pace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
