@@ -288,13 +288,15 @@ def trained(
 ) -> list[dict[str, float]]:
     """Train a policy until the next update would exceed `limit` core-seconds; return the lines of its metrics.
 
-    Each command trains up to a number of env steps that the rate so far suggests.
+    Each command trains up to a number of env steps that the rate so far suggests; the first, for one update of the
+    policy.
     """
     words = [*settings_of(args, way, seed), f"seed={seed}", "interval=5"]
     if start:
         words.append(f"start={start}")
     curve = lines_of(policy)
-    steps = curve[-1][STEPS] if curve else 1
+    ppo = compose_train(words).ppo
+    steps = curve[-1][STEPS] if curve else ppo.steps_per_update * (1 + (ppo.critic_updates if start else 0))
     while True:
         command("train", *words, f"ppo.env_steps={int(steps)}", "-o", policy)
         curve = lines_of(policy)
