@@ -23,7 +23,7 @@ from levelproof.pipeline.learn import train as module
 from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.trained_on import levels_for
 from tests.pace import patience, wait_until
-from tests.pipeline.command import COMMAND_SECONDS, assert_refused, here, run, start
+from tests.pipeline.command import COMMAND_SECONDS, assert_refused, heed_ctrl_c, here, run, start
 from tests.pipeline.learn.runs import assert_average_is_kept, assert_guide_lists, metrics, stop_after_saving
 
 LANES = (
@@ -132,7 +132,7 @@ def test_stopped_run_on_two_cores_continues_bit_for_bit(split: Path, tmp_path: P
     for name in ("whole", "stopped"):
         (tmp_path / name).mkdir()
     assert run(["train", "-o", "agent", *words], tmp_path / "whole").returncode == 0
-    process = start(["train", "-o", "agent", *words], tmp_path / "stopped")
+    process = start(["train", "-o", "agent", *words], tmp_path / "stopped", preexec_fn=heed_ctrl_c)
     wait_until((tmp_path / "stopped/agent/policy.safetensors").exists, COMMAND_SECONDS)
     process.send_signal(signal.SIGINT)
     assert process.wait(patience(COMMAND_SECONDS)) == 130
