@@ -288,8 +288,8 @@ def trained(
 ) -> list[dict[str, float]]:
     """Train a policy until the next update would exceed `limit` core-seconds; return the lines of its metrics.
 
-    Each command trains up to a number of env steps that the rate so far suggests; the first, for one update of the
-    policy.
+    Each command trains up to a number of env steps that the rate so far suggests; the first trains until the
+    policy has had one update, which comes after those that fit the critic of a start.
     """
     words = [*settings_of(args, way, seed), f"seed={seed}", "interval=5"]
     if start:

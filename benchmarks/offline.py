@@ -19,7 +19,7 @@ from benchmarks.report import Report, Table
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.learn.evaluate import AGENT, SOLVED
 from levelproof.pipeline.store.files import write
-from levelproof.pipeline.store.job_note import read_note
+from levelproof.pipeline.store.job_note import sound_note
 
 SCRIPT = Path(__file__).parents[1] / "docs" / "learners" / "offline_torchrl.py"
 METHODS = {  # name: the script's word for it
@@ -66,8 +66,7 @@ def run(args: argparse.Namespace) -> Report:
             "324 combined actions. Conservative Q-learning takes its best action, the others draw theirs. *Flat "
             "network*: an MLP of the same width and depth with an output for each choice of each entry; *levelproof "
             "clone*: the default, attention over entities.",
-            f"Core-seconds are CPU time of training, with reading and compiling. `{made_by(args.split)}` made the "
-            "split.",
+            f"Core-seconds are CPU time of training, with reading and compiling.{made_by(args.split)}",
         ],
     )
 
@@ -86,9 +85,14 @@ def require_same_data(args: argparse.Namespace) -> None:
 
 
 def made_by(split: Path) -> str:
-    """Return the command that made a split, without the words that decide nothing about its data."""
-    words = shlex.split(read_note(split).command)
-    return shlex.join(word for word in words if word.partition("=")[0] not in ("out", "executor"))
+    """Return a sentence with the command that made a split, without the words that decide nothing about its data.
+
+    Empty for a split without a job's note, such as a seed file.
+    """
+    if (note := sound_note(split)) is None:
+        return ""
+    words = [word for word in shlex.split(note.command) if word.partition("=")[0] not in ("out", "executor")]
+    return f" `{shlex.join(words)}` made the split."
 
 
 def exported(args: argparse.Namespace) -> str:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.__main__ import parser
-from benchmarks.offline import CLONES, METHODS, run
+from benchmarks.offline import CLONES, METHODS, made_by, run
 from tests.pipeline.made import played_split
 
 pytestmark = pytest.mark.campaign
@@ -23,3 +23,9 @@ def test_all_ways_learn_and_are_measured(tmp_path: Path) -> None:
     assert all(float(row[2]) > 0 for row in report.tables[0].rows[: len(METHODS)])
     assert report.notes[-1].endswith("`levelproof generate` made the split.")
     assert run(args).tables == report.tables, "finished networks and evaluations are kept"
+
+
+def test_split_without_a_note_has_no_command(tmp_path: Path) -> None:
+    assert made_by(tmp_path) == ""
+    split = played_split(tmp_path / "data")
+    assert made_by(split) == " `levelproof generate` made the split."
