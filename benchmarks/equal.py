@@ -34,6 +34,7 @@ POINTS = 100  # of its curve
 PACE = 84_500.0  # env steps of s a core-second of training from scratch where the first runs were made (AMD EPYC)
 PACED = 15  # updates that measure a processor's pace
 LOOKS = 0.25, 0.5, 1.0  # shares of the core-seconds after which a policy is measured
+LATE = 1.05  # of the time planned for training until then: how late that may be
 FIRST = 50_000  # id of the first level to clone from; the measured ones are sealed
 BETWEEN_SEEDS = 10_000_000  # ids
 SCRATCH = ("network.width=64",)
@@ -85,7 +86,7 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of all training")
     parser.add_argument("--measured", type=int, default=2048, help="sealed levels to measure on (default: 2048)")
     parser.add_argument("--folder", type=Path, default=Path("equal"), help="where everything is kept")
-    parser.add_argument("--core-seconds", type=float, default=3600, help="of each policy (default: 3600)")
+    parser.add_argument("--core-seconds", type=float, default=3600.0, help="of each policy (default: 3600)")
     parser.add_argument("--levels", default="8k", help="levels to search for a clone (default: 8k)")
     parser.add_argument("--updates", type=int, default=1500, help="updates of a clone (default: 1500)")
     parser.add_argument("--cloning", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of a clone")
@@ -128,7 +129,7 @@ def run(args: argparse.Namespace) -> Report:
             f"{f'; what {START} took is not counted' if any(WAYS[way].start == START for way in shown) else ''}. "
             "*Pace*: env steps that training from scratch on s takes in a CPU second of the core, with the learner of "
             f"that day. A core-second here is the CPU time of {PACE:,.0f} of them, so seconds of different paces are "
-            "comparable, to some 5%. *Of all*: "
+            "comparable: to some 5% on random levels, to 15% with `learnability`. *Of all*: "
             f"{players[ALL]['random']['levels']:,} levels, of which some cannot be solved; *of solved*, and the best "
             f"of 8 attempts at them: the {players[SOLVED]['random']['levels']:,} that are labelled solved.",
             *[f"*Teachers*: half of the clone's updates are of `levelproof distill {' '.join(DISTILLING)}`."]
@@ -184,7 +185,11 @@ def finished(args: argparse.Namespace, way: str, seed: int) -> Path:
 
 
 def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
-    """Make one policy, and measure it and its clone on sealed levels; core-seconds are those of PACE."""
+    """Make one policy, and measure it and its clone on sealed levels; core-seconds are those of PACE.
+
+    Raises:
+        UserError: nothing is left for training, or the folder has a longer run.
+    """
     folder, here = args.folder / f"{slug(way)}-{args.size}-{seed}", pace(args)
     scale = here / PACE  # of core-seconds
     start, before, clone = WAYS[way].start, 0.0, None
@@ -201,11 +206,17 @@ def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
     if before >= ends[-1]:
         raise UserError(f"{way}: what comes before training takes {before:,.0f} core-seconds: raise --core-seconds.")
     for spent in (end for end in ends if end > before):
-        look, so_far = look_at(f"{spent:g}"), lines_of(folder)
+        look, is_last = look_at(f"{spent:g}"), spent == ends[-1]
         limit = (spent - before) / scale  # in seconds of this processor
-        if spent < ends[-1] and (look.exists() or (so_far and so_far[-1][SECONDS] > limit)):
+        so_far = lines_of(folder)[-1:]
+        is_late = bool(so_far) and so_far[0][SECONDS] > LATE * limit
+        if is_last and is_late:
+            raise UserError(f"{folder} has a run of more than {spent:,.0f} core-seconds: choose another --folder.")
+        if not is_last and (is_late or look.exists()):
             continue  # a run that was stopped, or had fewer core-seconds, came that far
         curve = trained(args, folder, way, start, seed, limit)
+        if not is_last and curve[-1][SECONDS] > LATE * limit:
+            continue  # the first command takes longer
         rates = kept(args.folder / f"{folder.name}-{curve[-1][STEPS]}-{args.measured}.json", folder, *measuring(args))
         solved = rates[SOLVED][SAMPLED]["once"]
         told = {"planned": spent, SECONDS: before + scale * curve[-1][SECONDS], "solved": solved}
@@ -304,7 +315,8 @@ def trained(
         update = last[STEPS] / last[UPDATES]
         # Of a single update, most of the seconds are compiling
         rate = (last[STEPS] - first[STEPS]) / (last[SECONDS] - first[SECONDS]) if len(curve) > 1 else 0.0
-        left = limit - last[SECONDS] - first[SECONDS]  # the next command starts anew
+        begun = first[SECONDS] - (first[UPDATES] - 1) * update / rate if rate else first[SECONDS]
+        left = limit - last[SECONDS] - begun  # the next command starts anew
         if left <= 0 or (rate and left * rate < update):
             return curve
         steps = last[STEPS] + (left * rate // update * update if rate else update)

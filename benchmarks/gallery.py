@@ -207,10 +207,14 @@ def made_gallery(folder: Path, size: str, levels: int) -> tuple[Path, float]:
 
 
 def made_split(folder: Path, size: str, levels: int) -> Path:
-    """Write a split whose first UNIT levels were played at random; those that reach the goal are solved."""
+    """Write a split whose first UNIT levels were played at random; those that reach the goal are solved.
+
+    It replaces one whose writing was stopped.
+    """
     prepare_jax()
     job, rng = compose_job([f"out={folder}", f"size={size}", f"levels={levels}"]), np.random.default_rng(0)
     split, count = split_path(job.out, job.budget, job.size), min(UNIT, levels)
+    shutil.rmtree(split, ignore_errors=True)
     split.mkdir(parents=True)
     choices = rng.integers(0, 2, (RECORD_STEPS // HELD, ACTIONS, count))
     played = jax.tree.map(np.asarray, sample_levels(np.arange(count), size_of(size), job.distribution))

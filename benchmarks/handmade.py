@@ -30,6 +30,7 @@ from levelproof.experts.pool.run import UnitResult
 from levelproof.levelgen.batching import blocks
 from levelproof.levelgen.pictures.raster import draw, sheet
 from levelproof.levelgen.pictures.words import Caption
+from levelproof.physics.step import ENGINE_VERSION
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.read.level_files import level_at, levels_at, levels_below
 from levelproof.pipeline.runtime import cache_folder, own_cores, prepare_jax
@@ -143,7 +144,7 @@ def falls(job: JobConfig, levels: Mapping[str, Mapping[int, Origin]], sizes: Seq
 
 def ppo(origins: Mapping[int, Origin], folder: Path) -> list[dict[str, Any]]:
     """Train the reference's PPO on each level; return PPO_COLUMNS. The folder keeps results for later runs."""
-    settings = hashlib.sha256(repr((PPO, PPO_BUDGET)).encode()).hexdigest()[:12]
+    settings = hashlib.sha256(repr((PPO, PPO_BUDGET, ENGINE_VERSION)).encode()).hexdigest()[:12]
     files = {level_id: folder / f"{level_id}-{settings}.json" for level_id in origins}
     known = {level_id: json.loads(file.read_text()) for level_id, file in files.items() if file.exists()}
     missing = np.array([level_id for level_id in origins if level_id not in known])

@@ -151,6 +151,11 @@ def undecided(split: Path, count: int | None) -> Undecided:
         raise UserError(f"{split} does not say what its levels cost: name a split that `levelproof generate` wrote.")
     labels, searched = rows["label"].to_pylist(), np.array([one["search"] for one in seconds])
     these = np.flatnonzero([label in UNDECIDED for label in labels])
+    if not len(these):
+        raise UserError(
+            f"{split} has no searched level among its first {len(labels)}: raise --levels, or name another."
+        )
+    command = rows["command"][0].as_py().replace(" levels=1", f" levels={len(labels)}")
     rows = rows.take(these)
     return Undecided(
         levels_of(manifest, rows),
@@ -160,7 +165,7 @@ def undecided(split: Path, count: int | None) -> Undecided:
         steps[these],
         searched[these],
         sum(sum(one.values()) for one in seconds),
-        rows["command"][0].as_py().replace(" levels=1", f" levels={len(labels)}"),
+        command,
     )
 
 

@@ -89,9 +89,12 @@ def folders_of(size: str) -> dict[str, Path]:
     with oracle.alone(cache_folder() / "bench.lock"):
         if not source.is_dir():
             oracle.log(f"Labelling {LEVELS[size]} levels of size {size} to read (once, one to five minutes) ...")
+            unfinished = home / "unfinished"  # a stopped job resumes
             oracle.run_levelproof(
-                "generate", f"size={size}", f"levels={LEVELS[size]}", f"budget={BUDGET}", f"out={source.parents[1]}"
+                "generate", f"size={size}", f"levels={LEVELS[size]}", f"budget={BUDGET}", f"out={unfinished}"
             )
+            source.parent.mkdir(parents=True, exist_ok=True)
+            (unfinished / BUDGET / size).replace(source)
         folders = {name: home / name / size for name in (*DENSITIES, "kinetix")}
         for density in DENSITIES:
             if not folders[density].is_dir():

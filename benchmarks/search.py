@@ -31,9 +31,11 @@ from levelproof.experts.search.search import side_by_side
 from levelproof.experts.verdict.before import decide
 from levelproof.experts.witness.witness import replay
 from levelproof.levelgen.batching import blocks, take
+from levelproof.levelgen.identity.keys import SAMPLER_VERSION
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
+from levelproof.physics.step import ENGINE_VERSION
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.runtime import cache_folder, own_cores, prepare_jax
 
@@ -98,7 +100,7 @@ def searched(size: str, first: int, count: int, env_steps: int, cache: Path) -> 
     levels = jax.tree.map(np.asarray, sample_levels(ids, SIZES[size]))
     undecided = np.array([i for i, verdict in enumerate(decide(levels, DEFAULT_RULES).verdicts) if verdict is None])
     levels, ids = take(levels, undecided), ids[undecided]
-    settings = hashlib.sha256(repr(CONFIG).encode()).hexdigest()[:12]
+    settings = hashlib.sha256(repr((CONFIG, SAMPLER_VERSION, ENGINE_VERSION)).encode()).hexdigest()[:12]
     folder = cache / f"{size}-{settings}"
     rows = [read(folder, level_id) for level_id in ids]
     for max_steps in doublings(env_steps):

@@ -81,7 +81,8 @@ def run(args: argparse.Namespace) -> Report:
             f"Bytes per trajectory: those of *{RELEASED}* are {RECORD_STEPS} times the bytes of a transition in its 1M "
             f"split of this size; those of `full`, `resume` and `witness` {RECORD_STEPS} times what storage.md "
             "measured on witnesses of experts alone, which are longer than those of a search; those of `seed` are of "
-            f"the first {TRAJECTORIES:,} trajectories here, trivial ones included. All but `seed` keep whole records.",
+            f"the first {TRAJECTORIES:,} trajectories here, trivial ones included, and of the levels without one in "
+            "between. All but `seed` keep whole records.",
             f"![Bytes per trajectory of {found[0]['size']} on a logarithmic axis: released data, and our densities]"
             f"({PLOT})",
         ],
@@ -180,7 +181,8 @@ def bytes_of(part: Path, size: str) -> dict[str, float]:
     count = len(witnesses) - witnesses.null_count
     rows = [line.strip("| ").split(" | ") for line in (RESULTS / "storage.md").read_text().splitlines()]
     found = {f"`{row[2]}`": RECORD_STEPS * float(row[3]) for row in rows if row[0] == size and len(row) > 3}
-    return {RELEASED: RECORD_STEPS * PUBLISHED[size], **found, "`seed`": part.stat().st_size / count}
+    released = {RELEASED: RECORD_STEPS * PUBLISHED[size]} if size in PUBLISHED else {}
+    return {**released, **found, "`seed`": part.stat().st_size / count}
 
 
 def draw(kept: Mapping[str, float], path: Path) -> None:

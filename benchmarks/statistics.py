@@ -16,6 +16,11 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
+def too_few(successes: int, trials: int, share: float) -> bool:
+    """Whether successes are fewer than chance leaves (exact one-sided p < 0.001) if each trial succeeds at `share`."""
+    return bool(binomtest(successes, trials, share, alternative="less").pvalue < 1e-3)
+
+
 def mcnemar(only_one: int, only_other: int) -> float:
     """Return the exact two-sided p for levels that only one of two variants solved (McNemar 1947).
 

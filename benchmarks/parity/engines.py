@@ -28,6 +28,7 @@ from levelproof.physics.types import Manifold, Params, State
 from levelproof.pipeline.runtime import cache_folder
 
 RULES = TaskParams(dense_reward_scale=0.0)  # rewards are -1, 0 and 1
+GOES_ON, BROKEN_DOWN = 0, 2  # how an env step leaves an episode that ends neither with goal (1) nor with red (-1)
 GEOMETRY = {"normal": "normal", "penetration": "penetration", "point": "collision_point"}
 
 
@@ -62,8 +63,10 @@ def _one_step(level: Level, action: Int[Array, "6 lane"], params: Params) -> tup
 
 
 @jax.jit
-def _env_step(level: Level, action: Int[Array, "6 lane"]) -> State:
-    return task.advance(level, task.reset(level), action, RULES)[0].state
+def _env_step(level: Level, action: Int[Array, "6 lane"]) -> tuple[State, Array]:
+    now, result = task.advance(level, task.reset(level), action, RULES)
+    end = jnp.where(result.reward == 0, BROKEN_DOWN, jnp.sign(result.reward).astype(int))
+    return now.state, jnp.where(result.done, end, GOES_ON)
 
 
 @jax.jit
@@ -78,8 +81,8 @@ def step_ours(level: Level, action: Int[np.ndarray, "6 lane"], params: Params = 
     return Stepped(state, manifold.normal, manifold.penetration, manifold.point, control)
 
 
-def env_step_ours(level: Level, action: Int[np.ndarray, "6 lane"]) -> State:
-    """Take one env step in every lane, without reset."""
+def env_step_ours(level: Level, action: Int[np.ndarray, "6 lane"]) -> tuple[State, Int[np.ndarray, " lane"]]:
+    """Take one env step in every lane, without reset; return states, and how each episode ends: goal 1, red -1, ..."""
     return jax.device_get(_env_step(level, action))
 
 

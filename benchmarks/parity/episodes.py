@@ -14,7 +14,7 @@ from jaxtyping import Bool, Int
 
 from benchmarks.parity.causes import MOVES, is_broken, near_worlds, reached
 from benchmarks.parity.distance import MOTION, OFF, evolving_gaps, gap, largest
-from benchmarks.parity.engines import Played, Reference, env_step_ours, play_ours
+from benchmarks.parity.engines import BROKEN_DOWN, GOES_ON, Played, Reference, env_step_ours, play_ours
 from benchmarks.parity.onestep import Pool
 from benchmarks.parity.scenes import movable
 from benchmarks.parity.worlds import BLOCK, lanes_of, nudged_tree, starting_in
@@ -152,13 +152,11 @@ def _part(pair: Pool, lane: int, ours: State, theirs: State, a: Outcome, b: Outc
     """Investigate a pair, given records of its block, [..., step, lane]."""
     until = int(min(a.step[lane], b.step[lane])) + 1  # states before each action of both first episodes
     first, at_contact = _first_off(*(_until(states, lane, until) for states in (ours, theirs)))
-    step_off, explained = _steps(pair.level, _until(theirs, lane, int(b.step[lane]) + 1), pair.action)
-    if not explained:
-        reason = NOT_EXPLAINED
-    elif near_starts:
+    last = int(b.step[lane])
+    end = int(b.reward[lane]) or (GOES_ON if last + 1 == STEPS else BROKEN_DOWN)
+    step_off, reason = _steps(pair.level, _until(theirs, lane, last + 1), pair.action, end)
+    if near_starts and reason != NOT_EXPLAINED:
         reason = NEAR_STARTS_PART
-    else:
-        reason = STEPS_AGREE if step_off <= OFF else STEP_AMPLIFIES
     return Parted(
         scene=pair.scene[0],
         origin=pair.origin[0],
@@ -202,26 +200,34 @@ def _near_starts(level: Level, action: np.ndarray, lanes: np.ndarray, ours: Outc
     return counts
 
 
-def _steps(level: Level, states: State, action: np.ndarray) -> tuple[float, bool]:
-    """Take our env step from each state of the reference; return the largest difference, and if rounding explains it.
+def _steps(level: Level, states: State, action: np.ndarray, end: int) -> tuple[float, str]:
+    """Take our env step from each state of the reference; return the largest difference of states, and the reason.
 
     Args:
         level: one lane.
-        states: the reference's, one env step a lane; at most BLOCK.
+        states: the reference's, one env step a lane; at most BLOCK. It ends the episode after the last.
         action: [step, 6, 1].
+        end: how it ends there, as in `env_step_ours`.
     """
-    count = states.rotation.shape[-1]
-    if count < 2:
-        return 0.0, True
-    lane = np.minimum(np.arange(BLOCK), count - 2)
+    last = states.rotation.shape[-1] - 1
+    lane = np.minimum(np.arange(BLOCK), last)
     worlds = starting_in(lanes_of(level, np.zeros(BLOCK, int)), lanes_of(states, lane))
-    after = env_step_ours(worlds, action[lane, :, 0].T)
-    gaps = evolving_gaps(after, lanes_of(states, lane + 1))
-    apart = np.max([largest(gaps[name]) for name in MOTION], 0)
+    theirs = lanes_of(states, np.minimum(lane + 1, last))
+    after, ends = env_step_ours(worlds, action[lane, :, 0].T)
+    gaps = evolving_gaps(after, theirs)
+    apart = np.where(lane < last, np.max([largest(gaps[name]) for name in MOTION], 0), 0)  # the last state is unknown
+    their_ends = np.where(lane < last, GOES_ON, end)
+
+    def explained(k: int, is_like: Callable[[State, np.ndarray], bool]) -> bool:
+        """Whether worlds near the reference's do as it does after its k-th state, or it has broken down there."""
+        if is_broken(*lanes_of((states, theirs), [k])):
+            return True
+        world, action_there = lanes_of(worlds, [k]), np.repeat(action[lane[k]], BLOCK, 1)
+        return any(is_like(*env_step_ours(near_worlds(world, most), action_there)) for most in MOVES)
+
     worst = int(np.argmax(apart))
-    if apart[worst] <= OFF:
-        return float(apart[worst]), True
-    action_there = np.repeat(action[lane[worst]], BLOCK, 1)
-    world, theirs = lanes_of((worlds, lanes_of(states, lane + 1)), [worst])
-    reaches = (reached(env_step_ours(near_worlds(world, most), action_there), theirs) for most in MOVES)
-    return float(apart[worst]), any(reaches) or is_broken(theirs)
+    differs = [k for k in np.flatnonzero(ends != their_ends).tolist() if k <= last]
+    reasons = [explained(k, lambda _, ended, k=k: their_ends[k] in ended) for k in differs]
+    if apart[worst] > OFF:
+        reasons.append(explained(worst, lambda state, _: reached(state, lanes_of(theirs, [worst]))))
+    return float(apart[worst]), NOT_EXPLAINED if not all(reasons) else STEP_AMPLIFIES if reasons else STEPS_AGREE

@@ -9,6 +9,7 @@ from benchmarks.parity.campaign import SizeReport
 from benchmarks.parity.episodes import FIRST_OFF, NOT_EXPLAINED, Episodes
 from benchmarks.parity.onestep import DEFECT_OFF, LIMITS
 from benchmarks.report import Report, Table
+from benchmarks.statistics import too_few
 
 NEAR = LIMITS.index(1e-4)
 
@@ -32,12 +33,16 @@ def report_of(sizes: Sequence[SizeReport], settings: Mapping[str, Any], referenc
 
 
 def unexplained(sizes: Iterable[SizeReport]) -> list[str]:
-    """List the sources of unexplained states and episodes."""
+    """List the sources of unexplained states and episodes, and sizes with too few episodes alike."""
     differences = []
     for one in sizes:
         differences += [f"size {one.size}, {state.origin}" for state in one.one_step.off if not state.explained]
-        pairs = one.episodes.parted if one.episodes else []
-        differences += [f"size {one.size}, episode of {pair.origin}" for pair in pairs if pair.reason == NOT_EXPLAINED]
+        if not (played := one.episodes):
+            continue
+        pairs = [pair for pair in played.parted if pair.reason == NOT_EXPLAINED]
+        differences += [f"size {one.size}, episode of {pair.origin}" for pair in pairs]
+        if played.target and too_few(round(played.same * played.pairs), played.pairs, played.target):
+            differences.append(f"size {one.size}, {played.same:.1%} of episodes alike instead of {played.target:.0%}")
     return differences
 
 

@@ -71,6 +71,40 @@ def test_run_is_never_measured_later_than_planned(tmp_path: Path, monkeypatch: p
         planned[args.core_seconds] = [look["planned"] for look in looks]
         assert all(look[SECONDS] == look["planned"] - 1 for look in looks)
     assert planned == {200: [50, 100, 200], 400: [50, 100, 200, 400], 600: [50, 100, 200, 400, 600]}
+    args.core_seconds, kept = 200, {file: file.read_text() for file in tmp_path.glob("*after*")}
+    with pytest.raises(UserError, match="has a run of more than 200 core-seconds: choose another --folder"):
+        equal.measured(args, "from scratch", 0)
+    assert {file: file.read_text() for file in tmp_path.glob("*after*")} == kept
+
+
+def test_run_begun_too_late_for_a_look_is_measured_at_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def trained(args: Namespace, policy: Path, way: str, start: str, seed: int, limit: float) -> list[dict[str, float]]:
+        return [{UPDATES: 6, STEPS: 10, SECONDS: max(limit, 60.0), RATE: 0.5}]
+
+    monkeypatch.setattr(equal, "trained", trained)
+    monkeypatch.setattr(equal, "pace", lambda args: equal.PACE)
+    monkeypatch.setattr(equal, "kept", lambda *_: {SOLVED: {SAMPLED: {"once": {"rate": 0.5}}}})
+    args = parser("equal").parse_args(["equal", "--folder", str(tmp_path), "--core-seconds", "200"])
+    assert [look[SECONDS] for look in equal.measured(args, "from scratch", 0)["looks"]] == [100, 200]
+
+
+def test_first_updates_do_not_count_as_starting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first line may come after several updates; a command takes 30 seconds to start, an update 10."""
+    asked = []
+
+    def command(*words: str | Path) -> None:
+        asked.append(int(next(str(word) for word in words if "env_steps" in str(word)).partition("=")[2]))
+
+    def lines_of(_: Path) -> list[dict[str, float]]:
+        updates = [5, *(steps // 524_288 for steps in asked)] if asked else []
+        return [{UPDATES: each, STEPS: each * 524_288, SECONDS: 30.0 + 10 * each} for each in updates]
+
+    monkeypatch.setattr(equal, "command", command)
+    monkeypatch.setattr(equal, "lines_of", lines_of)
+    args = parser("equal").parse_args(["equal", "--folder", str(tmp_path)])
+    equal.trained(args, tmp_path, "levels, clone, reinforcement", "builtin:s", 0, 300)
+    assert asked[0] == 6 * 524_288
+    assert asked[-1] == (6 + (300 - 90 - 40) // 10) * 524_288
 
 
 def test_core_seconds_scale_with_the_pace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

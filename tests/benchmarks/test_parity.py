@@ -232,6 +232,17 @@ class TestPool:
         assert distinct(twice).origin == ["golden 1", "golden 2", "golden 3"]
 
 
+@pytest.fixture(scope="module")
+def touching(pool) -> tuple[int, np.ndarray, Played]:
+    """A lane that ends by touching within 20 env steps, one action more, and how our engine plays."""
+    action = np.repeat(pool.action[None], 21, 0)
+    played = play_ours(pool.level, pool.level.state, action[:20], record=True)
+    result = episodes.outcome(played)
+    lane = int(np.argmax((result.reward != 0) & (result.step > 0)))
+    assert result.reward[lane] != 0
+    return lane, action, played
+
+
 class TestEpisodes:
     def test_outcome_has_the_first_episodes_end(self) -> None:
         done = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 1], [1, 1, 1]], bool)
@@ -259,6 +270,21 @@ class TestEpisodes:
         active[0, 3:] ^= True
         _, at_contact = episodes._first_off(states, dataclasses.replace(states, position=moved, contact_active=active))
         assert at_contact
+
+    @pytest.mark.parametrize("shift", [-1, 0, 1])
+    def test_episodes_that_end_early_or_late_are_not_explained(self, pool, touching, shift) -> None:
+        """Ours stands in for the reference: the same states, but an end that is noticed an env step off."""
+        lane, action, played = touching
+        result = episodes.outcome(played)
+        last, end = int(result.step[lane]), int(result.reward[lane])
+        until = episodes._until(played.states, lane, last + 1 + min(shift, 0))
+        if shift > 0:  # the state after the end is not in the record, so this one stays
+            until = jax.tree.map(lambda x: np.concatenate([x, x[..., -1:]], -1), until)
+        off, reason = episodes._steps(pool.lanes(np.array([lane])).level, until, action[..., [lane]], end)
+        if shift:
+            assert reason == episodes.NOT_EXPLAINED
+        else:
+            assert (off, reason) == (0, episodes.STEPS_AGREE)
 
     def test_play_ours_records_states_before_actions(self, pool) -> None:
         action = np.repeat(pool.action[None], 3, 0)
@@ -314,6 +340,11 @@ class TestReport:
         assert [row.field for row in result.fields][:2] == ["position", "rotation"]
         assert result.defect.differ[0] >= result.defect.differ[1] > 0
         assert not report.fault
+
+    def test_report_faults_too_few_equal_episodes(self, sizes) -> None:
+        (one,) = sizes
+        fewer = dataclasses.replace(one, episodes=dataclasses.replace(one.episodes, pairs=400))
+        assert "(size s, 75.0% of episodes alike instead of 97%)" in report_of([fewer], {}, {}).fault
 
     @pytest.mark.slow
     def test_report_faults_another_engine(self, pool) -> None:
