@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -97,7 +98,7 @@ def source_of(split: Path, config: CloneConfig, tell: Callable[[str], None]) -> 
     """
     data = Dataset(split, config.where or None, (), config.validation)
     ids = data.manifest["level_id"].to_numpy()
-    require_not_sealed(split, ids)
+    require_not_sealed(split, ids, config.where)
     hashes = data.content_hashes
     usable = without_sealed(split, hashes, data.size, tell)
     copies = int((~usable).sum())
@@ -157,7 +158,7 @@ def train(
         say(console, text)
     with ProgressBar("levels read", feed.levels, console) as bar:
         batches = feed.batches(first, feed.read(first, bar.advance))
-    with shown(console, "reading validation levels", last, first) as show:
+    with closing(batches), shown(console, "reading validation levels", last, first) as show:
         held = {str(source.data.split): held_of(source, config) for source in sources}
         show(0, "compiling")
         for update, batch in enumerate(batches, first + 1):

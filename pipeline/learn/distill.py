@@ -4,6 +4,7 @@ In a round, the learner plays, teachers label states of its episodes (`rounds.py
 decides how a run continues is in its checkpoint or follows from the settings and the round's number.
 """
 
+import hashlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -129,7 +130,7 @@ def levels_for(split: Path, config: DistillConfig, tell: Callable[[str], None]) 
     """
     data = Dataset(split, config.where or None, (), 0.0)
     ids = data.manifest["level_id"].to_numpy()
-    require_not_sealed(split, ids)
+    require_not_sealed(split, ids, config.where)
     usable = without_sealed(split, data.content_hashes, data.size, tell)
     require_some_usable(split, usable)
     trivial = np.array([label == Label.TRIVIAL for label in data.manifest["label"].to_pylist()])
@@ -147,9 +148,10 @@ def levels_for(split: Path, config: DistillConfig, tell: Callable[[str], None]) 
     }
     experts = no_experts(len(chosen))
     if config.demonstrations or (config.states and config.teachers.expert):
-        experts = experts_of(split, ids[chosen])
-    if config.demonstrations:
+        experts = experts_of(split, ids[chosen], tell)
+    if experts.config:
         tell(f"{int((experts.expert >= 0).sum()):,} of {len(chosen):,} levels have a kept expert.")
+        facts["experts"] = weights_of(experts)
     if not experts.config and (config.demonstrations or not config.teachers.searches):
         only = "demonstrations need them" if config.demonstrations else "no other teacher is asked"
         remedy = "demonstrations=0 and states above 0" if config.demonstrations else "teachers.random above 0"
@@ -158,6 +160,14 @@ def levels_for(split: Path, config: DistillConfig, tell: Callable[[str], None]) 
             "machine with keep_experts=true."
         )
     return ChosenLevels(data, chosen, facts, experts)
+
+
+def weights_of(experts: KnownExperts) -> str:
+    """Return a digest of experts' weights, and of whose they are."""
+    digest = hashlib.sha256(experts.expert.tobytes())
+    for leaf in jax.tree.leaves(experts.params):
+        digest.update(np.ascontiguousarray(leaf).data)
+    return digest.hexdigest()[:16]
 
 
 def witnessed(levels: ChosenLevels, network: NetworkConfig, console: Console) -> TaughtLevels:

@@ -85,8 +85,7 @@ def evaluate(
         attempts = PROTOCOLS[on].attempts if on in PROTOCOLS else ATTEMPTS
     groups = [*_groups(on, where, sizes, count, starts, partial(say, console))]
     _require_sizes(contestants, groups)  # before anything is played
-    for group in groups:
-        own = _own_experts(group, on, experts, attempts)
+    for group, own in zip(groups, _own_experts(groups, on, experts, attempts), strict=True):
         facts.append(_measured(group, entrants, own, [each.main for each in contestants], attempts, seed, console))
         if np.isin(group.level_ids, SEALED_IDS).any():  # in a split of them, too
             looked_at.append(facts[-1])
@@ -196,16 +195,27 @@ def _log(one: _Contestant, looked_at: Sequence[dict[str, Any]], attempts: int, s
         say(console, f"Cannot write {one.looks}, so this evaluation is not recorded.")
 
 
-def _own_experts(group: MeasuredLevels, on: str, splits: Sequence[Path], attempts: int) -> list[Specialists]:
-    """Return the rated attempts of the levels' own experts.
+def _own_experts(
+    groups: Sequence[MeasuredLevels], on: str, splits: Sequence[Path], attempts: int
+) -> list[list[Specialists]]:
+    """Return the rated attempts of the own experts of each group's levels.
 
     If two splits have the same budget, the name of the second includes its split.
+
+    Raises:
+        UserError: a split is unusable, as `specialists_of` says, or has no level of any group's size.
     """
-    own = sealed_specialists(name_of(group.levels.size), len(group.level_ids), attempts) if on == SEALED else []
+    sealed = lambda group: sealed_specialists(name_of(group.levels.size), len(group.level_ids), attempts)
+    own = [sealed(group) if on == SEALED else [] for group in groups]
     for split in splits:
-        one = specialists_of(split, group.level_ids, attempts)
-        taken = any(one.name == other.name for other in own)
-        own.append(one._replace(name=f"{one.name}, {split}") if taken else one)
+        found = [specialists_of(split, group, attempts) for group in groups]
+        if not any(found):
+            sizes = ", ".join(dict.fromkeys(name_of(group.levels.size) for group in groups))
+            raise UserError(f"The levels of {split} are not of size {sizes}: name another split with --experts.")
+        for others, one in zip(own, found, strict=True):
+            if one:
+                taken = any(one.name == other.name for other in others)
+                others.append(one._replace(name=f"{one.name}, {split}") if taken else one)
     return own
 
 

@@ -7,6 +7,7 @@ import shlex
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -84,13 +85,20 @@ def with_stack(out: Path, note: dict[str, Any], tell: Callable[[str], None]) -> 
     Raises:
         Failure: the note is damaged.
     """
-    before, now = (note_in(out) or {}).get(MADE_BY, []), versions() | {"device": device()}
+    before, now = (note_in(out) or {}).get(MADE_BY, []), versions() | learned_with() | {"device": device()}
     if not (isinstance(before, list) and all(isinstance(each, dict) for each in before)):
         raise Failure(f"{out / RUN} is damaged ({MADE_BY}): choose another folder with -o.")
     if before and before[-1] != now:
         others = ", ".join(f"{name} {value}" for name, value in before[-1].items() if now.get(name) != value)
-        tell(f"This run was last trained with {others}, so its policy may differ from that of an uninterrupted run.")
+        if others:  # else an earlier version of this program noted fewer
+            differs = "so its policy may differ from that of an uninterrupted run"
+            tell(f"This run was last trained with {others}, {differs}.")
     return note | {MADE_BY: before if before[-1:] == [now] else [*before, now]}
+
+
+def learned_with() -> dict[str, str]:
+    """Return the versions of the libraries that decide a learner's bytes, besides those of every row."""
+    return {name: version(name) for name in ("numpy", "flax", "optax")}
 
 
 def _without(note: Any, path: Sequence[str]) -> Any:

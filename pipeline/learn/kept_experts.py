@@ -1,6 +1,7 @@
 """The experts that a split kept (`keep_experts`), as teachers of its levels."""
 
 from collections import defaultdict
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,23 +16,27 @@ from levelproof.pipeline.read.levels import recorded_settings
 from levelproof.pipeline.store.checkpoints import load_experts
 from levelproof.pipeline.store.layout import data_path
 from levelproof.pipeline.store.manifest import require_manifest
-from levelproof.pipeline.store.remote import is_remote
+from levelproof.pipeline.store.remote import as_typed, is_remote
 from levelproof.pipeline.store.seed.file import is_seed
 
 WITHOUT = "set teachers.expert=0 and demonstrations=0 to do without them"
 
 
-def experts_of(split: Path, level_ids: Int[np.ndarray, " level"]) -> KnownExperts:
-    """Load the experts of these levels; none if the split is remote or a seed file.
+def experts_of(split: Path, level_ids: Int[np.ndarray, " level"], tell: Callable[[str], None]) -> KnownExperts:
+    """Load the experts of these levels; none if the split is a seed file or remote, with a notice if it kept some.
 
     Raises:
         UserError: other users can write to the experts.
         Failure: they are damaged or missing, or another version wrote them.
     """
-    if is_remote(split) or is_seed(split):
+    if is_seed(split):
         return no_experts(len(level_ids))
     manifest = require_manifest(split, ["experts", "size"], level_ids)
     rows = manifest.table.to_pylist()
+    if is_remote(split):
+        if any(row["experts"] for row in rows):
+            tell(f"The experts that {as_typed(split)} kept are not asked: copy the split to this machine for that.")
+        return no_experts(len(level_ids))
     by_file: dict[str, list[int]] = defaultdict(list)
     for row in rows:
         if row["experts"]:

@@ -3,9 +3,10 @@
 So a run that was killed continues with the same batches, without a position to keep.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from dataclasses import replace
+from threading import Event
 from typing import NamedTuple
 
 import jax
@@ -81,9 +82,13 @@ def read_pool(
 
     with ThreadPoolExecutor(len(own_cores())) as threads:
         parts, some = [], [indices[i : i + AT_ONCE] for i in range(0, len(indices), AT_ONCE)]
-        for mine, part in zip(some, threads.map(read, some), strict=True):
-            parts.append(part)
-            follow(len(mine))
+        try:
+            for mine, part in zip(some, threads.map(read, some), strict=True):
+                parts.append(part)
+                follow(len(mine))
+        except BaseException:  # Ctrl-C does not wait for the others
+            threads.shutdown(wait=False, cancel_futures=True)
+            raise
     return _joined(parts)
 
 
@@ -136,25 +141,29 @@ class Feed:
         """Read the pools that an update draws from, one for each split; call `follow` as `read_pool` does."""
         return self._read(self._turn(update), follow)
 
-    def batches(self, first: int, pools: list[LevelPool]) -> Iterator[Transitions]:
+    def batches(self, first: int, pools: list[LevelPool]) -> Generator[Transitions, None, None]:
         """Yield the batches of all updates from number `first` on, which draws from `pools`."""
-        config = self._config
+        config, over = self._config, Event()
+
+        def ahead_of(turn: int) -> Future[list[LevelPool]] | None:
+            """Start to read the pools of the next turn; None: no update needs them."""
+            needed = self._changes and (turn + 1) * config.refresh < config.train.updates
+            return reader.submit(self._read, turn + 1, lambda _: _require(not over.is_set())) if needed else None
+
         with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as drawer:
             turn = self._turn(first)
-            coming = self._ahead(reader, turn)
+            coming = ahead_of(turn)
             ahead = drawer.submit(self._draw, pools, first)
-            for update in range(first, config.train.updates):
-                now = ahead.result()
-                if (after := self._turn(update + 1)) != turn and coming and update + 1 < config.train.updates:
-                    turn, pools = after, coming.result()
-                    coming = self._ahead(reader, turn)
-                ahead = drawer.submit(self._draw, pools, update + 1)
-                yield now
-
-    def _ahead(self, reader: ThreadPoolExecutor, turn: int) -> Future[list[LevelPool]] | None:
-        """Start to read the pools of the next turn; None: no update needs them."""
-        needed = self._changes and (turn + 1) * self._config.refresh < self._config.train.updates
-        return reader.submit(self._read, turn + 1) if needed else None
+            try:
+                for update in range(first, config.train.updates):
+                    now = ahead.result()
+                    if (after := self._turn(update + 1)) != turn and coming and update + 1 < config.train.updates:
+                        turn, pools = after, coming.result()
+                        coming = ahead_of(turn)
+                    ahead = drawer.submit(self._draw, pools, update + 1)
+                    yield now
+            finally:
+                over.set()  # a pool that is being read will not be needed
 
     @property
     def _changes(self) -> bool:
@@ -176,6 +185,11 @@ class Feed:
         rng = np.random.default_rng([self._config.seed, update])
         pool = pools[rng.choice(len(pools), p=self._weights)]
         return pool.draw(rng, rng.integers(0, len(pool.steps), self._config.train.batch))
+
+
+def _require(goes_on: bool) -> None:
+    if not goes_on:
+        raise CancelledError
 
 
 def validation_batches(source: PartedSplit, config: CloneConfig) -> list[Transitions]:

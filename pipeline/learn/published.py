@@ -71,10 +71,20 @@ def published_levels(
         raise UserError(f"The reference has no {name} levels of size {unknown[0]}: set --size to s, m or l.")
     folder = handmade_folder(say) if name == HANDMADE else None
     for size in sizes:
-        group = next(levels_in(folder / size, None, count, say)) if folder else _random(size, count)
+        group = _handmade(folder, size, count, say) if folder else _random(size, count)
         # Only all levels have the published rate
         rates = PROTOCOLS[name].rates[size] if count is None else {}
         yield group._replace(name=f"{name} {size}", published=rates)
+
+
+def _handmade(folder: Path, size: str, count: int | None, say: Callable[[str], None]) -> MeasuredLevels:
+    group = next(levels_in(folder / size, None, None, say))
+    if len(group.level_ids) != HANDMADE_LEVELS[size]:
+        raise Failure(
+            f"The folder {folder / size} does not have the {HANDMADE_LEVELS[size]} handmade levels of size {size}: "
+            f"delete {folder}, and they are fetched again."
+        )
+    return group.first(count)
 
 
 def handmade_folder(say: Callable[[str], None] = print) -> Path:
@@ -146,7 +156,7 @@ def _random(size: str, count: int | None) -> MeasuredLevels:
             f"The reference's random levels of size {size} are not on this machine: write them with `python -m "
             "benchmarks.published` in a checkout of levelproof (once, some minutes; installs the reference beside it)."
         ) from None
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise Failure(f"The file {path} is damaged ({error}): delete it and write it again.") from None
     ids = np.array(list(map(level_id_for, content_hashes(levels))))
     if levels.size != SIZES[size] or len(ids) != RANDOM_LEVELS:

@@ -58,12 +58,13 @@ def sealed_hashes(size: Size) -> frozenset[str]:
     return frozenset(content_hash for name in names for content_hash in _kept(name))
 
 
-def require_not_sealed(split: Path, ids: Int[np.ndarray, " level"]) -> None:
-    """Raise UserError if a split has sealed ids among these."""
+def require_not_sealed(split: Path, ids: Int[np.ndarray, " level"], where: str) -> None:
+    """Raise UserError if a split has sealed ids among these, which the condition `where` selects."""
     if sealed := int(((ids >= SEALED.start) & (ids < SEALED.stop)).sum()):
+        condition = f"({where}) AND level_id < {SEALED.start}" if where else f"level_id < {SEALED.start}"
         raise UserError(
             f"{split} has {many(sealed, 'level')} with ids from {SEALED.start} to {SEALED.stop - 1}, which are sealed "
-            f"to measure policies: exclude them, as in where='level_id < {SEALED.start}'."
+            f'to measure policies: exclude them, as in where="{condition}".'
         )
 
 

@@ -9,12 +9,17 @@ import pyarrow.compute as pc
 from jaxtyping import Int
 
 from levelproof.experts.labels import Label
+from levelproof.levelgen.batching import take
+from levelproof.levelgen.identity.content import content_hashes
+from levelproof.levelgen.level import name_of
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.learn.measured import MeasuredLevels
 from levelproof.pipeline.learn.sealed import known_sealed
 from levelproof.pipeline.learn.solve_rates import Solved
 from levelproof.pipeline.store.manifest import require_manifest
 
 ATTEMPTS = 16  # attempts per expert in splits whose configuration does not say
+COMPARED = 64  # levels whose content is compared with that of the split's
 
 
 class Specialists(NamedTuple):
@@ -24,18 +29,25 @@ class Specialists(NamedTuple):
     solved: Solved  # first episodes with sampled actions; without a rate: all solved if the level is trivial, else none
 
 
-def specialists_of(split: Path, level_ids: Int[np.ndarray, " level"], attempts: int) -> Specialists:
+def specialists_of(split: Path, levels: MeasuredLevels, attempts: int) -> Specialists | None:
     """Return the rated attempts of the experts of these levels, at most `attempts` of each.
 
     A level without a rate counts as solved in every attempt if it is trivial, else in none. The order of a level's
     attempts is drawn, because a row has only their share.
 
+    Returns:
+        None if the split's levels are of another size.
+
     Raises:
-        UserError: there is no such split, it lacks a level, or none of its solved levels has a rate.
+        UserError: there is no such split, it lacks a level or has another one of its id, or none of its solved levels
+            has a rate.
         Failure: the split is damaged.
     """
-    manifest = require_manifest(split, ["level_id", "label", "success_rate", "budget"])
+    manifest = require_manifest(split, ["level_id", "label", "success_rate", "budget", "size"])
     table, config = manifest.table, manifest.config or {}
+    if table.num_rows and table["size"][0].as_py() != name_of(levels.levels.size):
+        return None
+    level_ids = levels.level_ids
     row_of = {level_id: row for row, level_id in enumerate(table["level_id"].to_pylist())}
     missing = [level_id for level_id in level_ids.tolist() if level_id not in row_of]
     if missing:
@@ -43,6 +55,7 @@ def specialists_of(split: Path, level_ids: Int[np.ndarray, " level"], attempts: 
             f"{split} lacks {len(missing):,} of the levels, such as {missing[0]}: label them there first, or name "
             "another split with --experts."
         )
+    _require_same_levels(split, levels)
     rows = table.take([row_of[level_id] for level_id in level_ids.tolist()])
     rates = table.filter(pc.field("label") == Label.SOLVED)["success_rate"]
     if len(rates) and rates.null_count == len(rates):
@@ -53,6 +66,22 @@ def specialists_of(split: Path, level_ids: Int[np.ndarray, " level"], attempts: 
     own = config.get("expert", {}).get("attempts", ATTEMPTS)
     solved = _drawn(successes_of(rows, own), own, attempts)
     return Specialists(_named(rows["budget"][0].as_py(), solved, attempts), solved)
+
+
+def _require_same_levels(split: Path, levels: MeasuredLevels) -> None:
+    """Raise UserError if a split has other levels of these ids: of another distribution, or imported ones."""
+    if levels.start:
+        return  # states within witnesses, whose hashes differ
+    ids = levels.level_ids[:COMPARED]
+    rows = require_manifest(split, ["level_id", "content_hash"], ids).table.sort_by("level_id")
+    hash_of = dict(zip(rows["level_id"].to_pylist(), rows["content_hash"].to_pylist(), strict=True))
+    ours = content_hashes(take(levels.levels, np.arange(len(ids))))
+    others = [i for i, ours_of_it in zip(ids.tolist(), ours, strict=True) if hash_of[i] != ours_of_it]
+    if 2 * len(others) > len(ids):  # few may differ by rounding, where a GPU sampled them
+        raise UserError(
+            f"{split} has other levels with the ids of {levels.name}, such as {others[0]}: name a split of the same "
+            "levels with --experts."
+        )
 
 
 def sealed_specialists(size: str, count: int, attempts: int) -> list[Specialists]:

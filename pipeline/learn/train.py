@@ -44,7 +44,7 @@ from levelproof.pipeline.learn.pace import Pace
 from levelproof.pipeline.learn.trained_on import TrainingLevels, levels_for
 from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.runtime import own_cores, prepare_jax
-from levelproof.pipeline.words import duration
+from levelproof.pipeline.words import duration, many
 
 COURSE = Curves(
     "train/env_steps",
@@ -75,6 +75,9 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
         require_size(start, source.levels.size, source.name, "start from one that plays any size")
         tell(f"Trains {config.start} on {source.name}.")
     recipe = recipe_of(config, source, start, cores)
+    if (share := config.ppo.samples(cores) * cores / config.ppo.environments) < config.ppo.subsample:
+        of_cores = f"{many(cores, 'core')} of {many(config.ppo.environments // cores, 'lane')}"
+        tell(f"Learns from {share:.1%} of the samples instead of {config.ppo.subsample:.1%}: on {of_cores}.")
     note = note_of(config, source, cores)
     params = None if start is None else start.params
     with writing_run(out) as require_ours:

@@ -10,6 +10,7 @@ import numpy as np
 
 from levelproof.configs.compose import distributions
 from levelproof.configs.errors import suggestion
+from levelproof.configs.schema import JobConfig
 from levelproof.configs.train import CURRICULA, TrainConfig
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.identity.content import content_hashes
@@ -48,7 +49,7 @@ def levels_for(config: TrainConfig, tell: Callable[[str], None]) -> TrainingLeve
         )
     split, groups = is_split(place), _groups(config, tell)
     if split:
-        require_not_sealed(place, groups[0].level_ids)
+        require_not_sealed(place, groups[0].level_ids, config.where)
     hashes = np.array(content_hashes(groups[0].levels))
     usable = without_sealed(place, hashes, groups[0].levels.size, tell)
     require_some_usable(place, usable)
@@ -57,6 +58,9 @@ def levels_for(config: TrainConfig, tell: Callable[[str], None]) -> TrainingLeve
     levels = jax.device_put(concatenate_levels(parts))
     digest = hashlib.sha256("".join(hashes[usable]).encode()).hexdigest()[:16]
     facts = {"levels": str(place), "count": len(parts[0]), "content": digest}
+    if len(groups) > 1:
+        midway = b"".join(np.asarray(group.levels.state.position).tobytes() for group in groups[1:])
+        facts["states"] = hashlib.sha256(midway).hexdigest()[:16]
     return TrainingLevels(str(place), levels, groups[0].rules, facts)
 
 
@@ -90,10 +94,12 @@ def _groups(config: TrainConfig, tell: Callable[[str], None]) -> list[MeasuredLe
 
 
 def _random(config: TrainConfig) -> TrainingLevels:
+    distribution = distributions()[config.distribution]
     try:
-        levels = sampler(config.size, distributions()[config.distribution])
+        JobConfig(size=config.size, distribution=distribution)  # raises if no job can have such levels
+        levels = sampler(config.size, distribution)
     except ValueError as error:
-        raise UserError(f"Cannot sample levels: {error}.") from None
+        raise UserError(f"Cannot sample levels: {str(error).rstrip('.')}.") from None
     name = f"random {config.size}"
     return TrainingLevels(
         f"random levels of size {config.size}",

@@ -2,8 +2,10 @@
 
 import runpy
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import jax
@@ -29,8 +31,8 @@ class Agent:
     time.
     """
 
-    def __init__(self, name: str, act: Callable[..., Any]) -> None:
-        self.name, self.act = name, act
+    def __init__(self, name: str, act: Callable[..., Any], neighbours: "Neighbours") -> None:
+        self.name, self.act, self.neighbours = name, act, neighbours
         self.error: str | None = None  # the first failure; afterwards the agent does nothing
 
     def __call__(self, params: Any, moment: Moment) -> Int[Array, "6 lane"]:
@@ -45,7 +47,8 @@ class Agent:
         if self.error is not None:
             return nothing
         try:
-            action = np.asarray(self.act(observation, live, uniform))
+            with self.neighbours.within_reach():
+                action = np.asarray(self.act(observation, live, uniform))
         except Exception as error:
             self.error = f"{ACT} of {self.name} failed: {type(error).__name__}: {error}"
             return nothing
@@ -61,6 +64,30 @@ class Agent:
         return action.astype(np.int32).T
 
 
+class Neighbours:
+    """The modules beside an agent's file, which it may import; those of another agent may have the same names."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._imported = dict[str, ModuleType]()
+
+    @contextmanager
+    def within_reach(self) -> Iterator[None]:
+        """Let code import them, as `python FILE` does; afterwards nothing else finds them."""
+        before = set(sys.modules)
+        known = {name.partition(".")[0] for name in before}
+        sys.path.insert(0, str(self._folder))
+        sys.modules.update(self._imported)
+        try:
+            yield
+        finally:
+            sys.path.remove(str(self._folder))
+            for name in sys.modules.keys() - before:
+                beside = self._folder / (top := name.partition(".")[0])
+                if top not in known and (beside.with_suffix(".py").is_file() or (beside / "__init__.py").is_file()):
+                    self._imported[name] = sys.modules.pop(name)
+
+
 def agent_in(file: Path) -> Agent:
     """Run a Python file, which may import its neighbours, and return the agent whose function `act` it defines.
 
@@ -69,19 +96,12 @@ def agent_in(file: Path) -> Agent:
     """
     if not file.is_file():
         raise UserError(f"There is no agent at {file}: name a Python file that defines {ACT}.")
-    folder = file.parent.absolute()
-    sys.path.insert(0, str(folder))  # as `python FILE` does
-    before = set(sys.modules)
-    known = {name.partition(".")[0] for name in before}
+    neighbours = Neighbours(file.parent.absolute())
     try:
-        act = runpy.run_path(str(file)).get(ACT)
+        with neighbours.within_reach():
+            act = runpy.run_path(str(file)).get(ACT)
     except (Exception, SystemExit) as error:
         raise UserError(f"{file} failed: {type(error).__name__}: {error}.") from None
-    finally:  # another agent's neighbours may have the same names
-        for name in sys.modules.keys() - before:
-            beside = folder / (top := name.partition(".")[0])
-            if top not in known and (beside.with_suffix(".py").is_file() or (beside / "__init__.py").is_file()):
-                del sys.modules[name]
     if not callable(act):
         raise UserError(f"{file} defines no function {ACT}: docs/evaluate.md says what it is called with.")
-    return Agent(str(file), act)
+    return Agent(str(file), act, neighbours)

@@ -10,6 +10,7 @@ import numpy as np
 
 from levelproof.configs.convert import flat, plain
 from levelproof.configs.schema import JobConfig
+from levelproof.experts.networks.saved import CONFIG, WEIGHTS
 from levelproof.levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
 from levelproof.levelgen.identity.content import content_hashes, level_id_for
 from levelproof.levelgen.level import Level, concatenate_levels, name_of, size_of
@@ -70,10 +71,11 @@ def levels_below(folder: Path, job: JobConfig) -> Listing:
 
 
 def level_file_paths(folder: Path) -> list[Path]:
-    """Return the JSON files below a folder, in order, without those of splits, which a job may have written there."""
+    """Return the JSON files below a folder, in order, without those of splits and policies written there."""
     paths = sorted(folder.rglob("*.json"))
     splits = {path.parent for path in paths if path.name == JOB and (path.parent / MANIFEST).is_dir()}
-    return [path for path in paths if splits.isdisjoint(path.parents)]
+    policies = {path.parent for path in paths if path.name == CONFIG and (path.parent / WEIGHTS).is_file()}
+    return [path for path in paths if (splits | policies).isdisjoint(path.parents)]
 
 
 def _origin_of(path: Path, job: JobConfig) -> Origin:

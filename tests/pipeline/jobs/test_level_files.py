@@ -289,8 +289,11 @@ def test_ray_workers_read_level_files_and_no_process_with_jax_forks(once: Path, 
     assert rows_of(tmp_path / "data/5k/s").keys() == rows_of(once / "data/5k/s").keys()
 
 
-def test_files_of_a_split_below_the_folder_are_not_level_files(folder: Path) -> None:
+def test_files_of_splits_and_policies_below_the_folder_are_not_level_files(folder: Path) -> None:
     """Such as one that an earlier run of the same command wrote there."""
     (folder / "data").rename(folder / "mine/data")
+    (folder / "mine/agent").mkdir()
+    for name in ("config.json", "run.json", "policy.safetensors"):  # of a policy
+        (folder / "mine/agent" / name).touch()
     names = {path.name for path in level_file_paths(folder / "mine")}
     assert names == {"a.json", "copy.json", "b c.json", "larger.json", "rules.json", "bad.json"}

@@ -3,6 +3,8 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from threading import Event, Timer
+from time import sleep
 from typing import Any
 
 import jax
@@ -33,6 +35,7 @@ from levelproof.pipeline.learn.sealed import SEALED
 from levelproof.pipeline.learn.trained_on import levels_for
 from levelproof.pipeline.runtime import CACHE_VARIABLE
 from levelproof.pipeline.store.locks import only_trainer
+from tests.pace import patience
 from tests.pipeline.command import assert_refused, here
 from tests.pipeline.learn.runs import assert_guide_lists, metrics
 from tests.pipeline.made import played_split
@@ -198,6 +201,30 @@ def test_levels_that_no_update_draws_from_are_counted(split: Path, updates: int,
     source = source._replace(train=source.train[:count])
     assert Feed([source], replace(config, pool=count // 2)).used == share * count
     assert Feed([source], config).used == count, "all are in memory"
+
+
+def test_a_stopped_run_does_not_read_the_levels_of_the_next_pool(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = module.source_of(split, CloneConfig(), lambda _: None)
+    config = CloneConfig(pool=len(source.train) // 2, refresh=4, train=ImitationConfig(9, batch=4))
+    feed, begun, going_on, read = Feed([source], config), Event(), Event(), list[int]()
+    pools, read_in_full = feed.read(0), source.data.read
+
+    def slowly(some: np.ndarray, **how: Any) -> Any:
+        begun.set()
+        assert going_on.wait(patience(60))
+        read.append(len(some))
+        sleep(0.2)
+        return read_in_full(some, **how)
+
+    monkeypatch.setattr(pool_module, "AT_ONCE", 1)
+    monkeypatch.setattr(pool_module, "own_cores", lambda: [0])
+    monkeypatch.setattr(source.data, "read", slowly)
+    batches = feed.batches(0, pools)
+    next(batches)
+    assert begun.wait(patience(60))
+    Timer(0.2, going_on.set).start()
+    batches.close()
+    assert len(read) <= 2 < feed.levels, "none but those under way"
 
 
 def test_bad_input_is_refused(split: Path, policy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -201,14 +201,18 @@ def test_experts_that_a_split_kept_are_those_of_their_levels(
         kept_experts, "require_manifest", lambda *_: SimpleNamespace(table=table, config=manifest.config)
     )
     monkeypatch.setattr(kept_experts, "data_path", lambda *_: tmp_path / "experts.npz")
-    known = experts_of(split, ids)
+    known = experts_of(split, ids, print)
     assert known.config == job.expert
     assert (known.expert >= 0).tolist() == [False, True, False, True, False]
     leaf = jax.tree.leaves(known.params)[0]
     assert [np.unique(leaf[known.expert[i]]).tolist() for i in (1, 3)] == [[1], [3]]
     (tmp_path / "experts.npz").write_bytes(b"")
     with pytest.raises(levelproof.Failure, match=r"cannot be read .*: set teachers.expert=0"):
-        experts_of(split, ids)
+        experts_of(split, ids, print)
+    told = list[str]()
+    monkeypatch.setattr(kept_experts, "is_remote", lambda _: True)
+    assert experts_of(split, ids, told.append).config is None
+    assert told == [f"The experts that {split} kept are not asked: copy the split to this machine for that."]
 
 
 def test_experts_whose_updates_need_a_larger_budget_are_read(
@@ -221,7 +225,7 @@ def test_experts_whose_updates_need_a_larger_budget_are_read(
     )
     monkeypatch.setattr(kept_experts, "require_manifest", lambda *_: SimpleNamespace(table=table, config=job.results))
     monkeypatch.setattr(kept_experts, "data_path", lambda *_: tmp_path / "experts.npz")
-    assert experts_of(split, ids).config == job.expert
+    assert experts_of(split, ids, print).config == job.expert
 
 
 def test_levels_are_witnessed_and_neither_trivial_nor_sealed(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -59,16 +59,29 @@ def test_experts_of_a_split_stand_beside_the_baselines(split: Path, tmp_path: Pa
     """Their rates are those of the rows; levels that the split lacks are named."""
     rows = read_manifest(split).table.sort_by("level_id").to_pylist()
     ids = np.array([row["level_id"] for row in rows])
-    name, solved = specialists_of(split, ids[::-1], 16)
+    group = next(levels_in(split, None, None, print))
+    chosen = lambda some: group._replace(level_ids=group.level_ids[some], levels=take(group.levels, some))
+    found = specialists_of(split, chosen(np.arange(len(ids))[::-1]), 16)
+    assert found
+    name, solved = found
     assert name.startswith("its own expert, ")
     expected = [1.0 if row["label"] == "trivial" else row["success_rate"] or 0.0 for row in rows]
     np.testing.assert_allclose(solved.mean(1)[::-1], expected, atol=1e-6)
     assert 0 < np.mean(expected) < 1
-    assert specialists_of(split, ids, 3).solved.shape == (len(ids), 3)
+    fewer = specialists_of(split, group, 3)
+    assert fewer
+    assert fewer.solved.shape == (len(ids), 3)
+    pair = chosen(np.arange(2))
     with pytest.raises(UserError, match=r"lacks 1 of the levels, such as 2000000000:"):
-        specialists_of(split, np.array([ids[0], 2_000_000_000]), 1)
+        specialists_of(split, pair._replace(level_ids=np.array([ids[0], 2_000_000_000])), 1)
+    with pytest.raises(UserError, match=rf"has other levels with the ids of .*, such as {ids[1]}: name a split"):
+        specialists_of(split, pair._replace(level_ids=ids[[1, 0]]), 1)
+    labelled = ROOT / "manifests" / "16k" / "m"
     with pytest.raises(UserError, match="16k/m has no success rates, because procedure=label"):
-        specialists_of(ROOT / "manifests" / "16k" / "m", np.arange(3), 1)
+        specialists_of(labelled, next(levels_in(labelled, "level_id < 3", None, print)), 1)
+    assert specialists_of(labelled, group, 1) is None, "levels of another size"
+    done = here(["evaluate", "--on", str(split), "--experts", str(labelled), *ONCE], tmp_path)
+    assert_refused(done, 2, "16k/m are not of size s: name another split with --experts")
     words = "--on", str(split), "--experts", str(split), str(split), "--levels", "4", *ONCE
     (group,) = facts(tmp_path, *words)["levels"]
     assert list(group["of"]["all"])[-2:] == [name, f"{name}, {split}"], "none replaces another of its budget"
@@ -211,9 +224,17 @@ def test_agents_import_neighbours_of_the_same_name(tmp_path: Path, monkeypatch: 
     for choice in (0, 1):
         (folder := tmp_path / str(choice)).mkdir()
         (folder / "net.py").write_text(f"choice = {choice}")
-        (folder / "agent.py").write_text("import net\n\n\ndef act(*seen): return net.choice")
+        (folder / "late.py").write_text(f"choice = {choice}")
+        (folder / "agent.py").write_text(
+            "import numpy, net\n\n\ndef act(seen, live, uniform):\n"
+            "    import late\n\n    assert net.choice == late.choice\n"
+            "    return numpy.full(uniform.shape, late.choice)\n"
+        )
     zero, one = (agent_in(tmp_path / str(choice) / "agent.py") for choice in (0, 1))
-    assert (zero.act(), one.act()) == (0, 1)
+    for _ in range(2):
+        for choice, agent in enumerate((zero, one)):
+            assert (agent._actions(*np.zeros((3, 6, 4))) == choice).all(), agent.error
+    assert not {"net", "late"} & sys.modules.keys()
 
 
 @pytest.mark.parametrize(
@@ -308,6 +329,9 @@ def test_levels_of_the_reference_are_played_by_its_protocol(
     assert played["handmade"] == played["reference-random"]
     (group,) = facts(tmp_path, "--on", "handmade", "--size", "s", "--levels", "2")["levels"]
     assert not group["published"], "the published rate is that of all levels"
+    (folder / "2.json").write_text("{")
+    done = here(["evaluate", "--on", "handmade", "--size", "s"], tmp_path)
+    assert_refused(done, 1, f"The folder {folder} does not have the 3 handmade levels of size s")
 
 
 def test_missing_levels_of_the_reference_are_explained(
@@ -318,8 +342,9 @@ def test_missing_levels_of_the_reference_are_explained(
     words = ["evaluate", "--size", "s", "--on"]
     assert_refused(here([*words, "handmade"], tmp_path), 2, "pip download --no-deps kinetix-env==3.0.2")
     assert_refused(here([*words, "reference-random"], tmp_path), 2, "python -m benchmarks.published")
-    published.random_file("s").write_bytes(b"damaged")
-    assert_refused(here([*words, "reference-random"], tmp_path), 1, "delete it and write it again")
+    for damaged in b"damaged", b"":
+        published.random_file("s").write_bytes(damaged)
+        assert_refused(here([*words, "reference-random"], tmp_path), 1, "delete it and write it again")
 
 
 def test_levels_of_the_reference_need_a_folder_that_can_be_written(

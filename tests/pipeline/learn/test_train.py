@@ -243,7 +243,7 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     fewer = levels_for(TrainConfig(levels=str(split), where=f"label = 'solved' AND level_id > {ids[0]}"), print)
     assert source.facts["content"] != fewer.facts["content"]
     midway = levels_for(TrainConfig(levels=str(split), where="label = 'solved'", starts=2), print)
-    assert midway.facts == source.facts, "starts is among the settings of the note"
+    assert midway.facts == source.facts | {"states": midway.facts["states"]}, "the settings of the note have starts"
     at = np.array(data.manifest["steps_to_goal"].to_pylist()) // 2
     half = np.moveaxis(data.state(np.arange(len(ids)), at).level.state.position, 0, -1)
     assert np.array_equal(midway.levels.state.position, np.append(source.levels.state.position, half, -1))
@@ -253,8 +253,10 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert not messages
     first = ids[0]
     monkeypatch.setattr(sealed, "SEALED", range(first, first + 2))
-    with pytest.raises(levelproof.UserError, match="sealed to measure policies"):
+    with pytest.raises(levelproof.UserError, match=f'sealed to measure policies.*where="level_id < {first}"'):
         levels_for(TrainConfig(levels=str(split), where=""), print)
+    with pytest.raises(levelproof.UserError, match=rf"where=\"\(label = 'solved'\) AND level_id < {first}\""):
+        levels_for(TrainConfig(levels=str(split), where="label = 'solved'"), print)
     with pytest.raises(levelproof.UserError, match="only copies of sealed levels"):
         levels_for(TrainConfig(levels=str(tmp_path)), print)  # their content, whatever their ids
 
@@ -264,6 +266,8 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     [
         (["ppo.env_step=3"], "did you mean ppo.env_steps?"),
         (["ppo.subsample=1.5"], "ppo.subsample is 1.5: it must be above 0 and at most 1"),
+        (["size=6-0-1-0"], "Cannot sample levels: size is 6-0-1-0: it has no room for the actuators"),
+        (["size=60-2-0-1"], "Cannot sample levels: size is 60-2-0-1: a level has at most"),
         (["ppo.repeat=257"], "ppo.repeat is 257: it must be between 1 and 256"),
         (["levels=learnabilty"], "There are no levels at learnabilty"),
         (["size=s", "levels=some/split"], "size has no effect"),
