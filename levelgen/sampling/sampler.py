@@ -5,7 +5,9 @@ processor, or XLA operations on devices without it. `sampling.block` has the ord
 """
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -169,3 +171,11 @@ def kernel_of(size: Size, dist: Distribution) -> Kernel:
         sample_block(results, scratch, layout, dist)
 
     return Kernel(body, Buffer((), "int32"), SCENERY, buffers_of(Results, size), scratch_of(size, layout))
+
+
+def on_cpu() -> AbstractContextManager[Any]:
+    """Let this thread compute on the CPU if JAX has one: levels have the same bits on any, but not on a GPU."""
+    try:
+        return jax.default_device(jax.local_devices(backend="cpu")[0])
+    except RuntimeError:  # JAX_PLATFORMS=cuda
+        return nullcontext()

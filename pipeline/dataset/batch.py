@@ -140,6 +140,19 @@ def whole_numbers(values: ArrayLike, what: str) -> Int[np.ndarray, "..."]:
     return given.astype(np.int64)
 
 
+def in_a_row(values: ArrayLike, what: str, count: int | None = None) -> Int[np.ndarray, " item"]:
+    """Convert integers [item] to int64; a scalar counts as `count` of them, by default one.
+
+    Raises:
+        UserError: they are no integers, have several axes, or are not `count`.
+    """
+    given = whole_numbers(values, what)
+    if given.ndim > 1 or (given.ndim and count is not None and len(given) != count):
+        wanted = "one axis" if count is None else f"the shape [{count}], as the indices"
+        raise UserError(f"The {what} have the shape {[*given.shape]}: they must have {wanted}.")
+    return np.broadcast_to(given, count) if count is not None else np.atleast_1d(given)
+
+
 def require_steps(steps: np.ndarray) -> None:
     """Raise UserError unless all of these are steps of a record."""
     if ((steps < 0) | (steps >= RECORD_STEPS)).any():

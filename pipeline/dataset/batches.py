@@ -83,10 +83,13 @@ class Batches(Iterator[T], Generic[T]):
         return finished
 
     def _has_loaded(self) -> bool:
-        """Whether a batch can be finished; waits for it if none is being finished."""
-        if not self._loaded and self._ahead and (not self._finished or self._ahead[0][1].done()):
-            some, loaded = self._ahead.popleft()
-            self._loaded.extend(loaded.result()[: len(some)])
+        """Whether a batch can be finished; waits for it if none is being finished, and raises if loading it failed."""
+        if not self._loaded and self._ahead:
+            some, loading = self._ahead[0]
+            if self._finished and not (loading.done() and loading.exception() is None):
+                return False  # those before it are returned first
+            self._ahead.popleft()
+            self._loaded.extend(loading.result()[: len(some)])
         return bool(self._loaded)
 
     def state(self) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from levelproof.pipeline.dataset.batch import (
     Batch,
     batch_of,
     expand_fields,
+    in_a_row,
     require_steps,
     state_in,
     timed_out,
@@ -32,7 +33,7 @@ from levelproof.pipeline.dataset.batches import Batches, batches_of
 from levelproof.pipeline.dataset.differing import KEEP, Differing
 from levelproof.pipeline.dataset.episodes import GOAL, EpisodeBatch, gather_episodes
 from levelproof.pipeline.dataset.observations import observe, parse_observation
-from levelproof.pipeline.dataset.order import EpochOrder
+from levelproof.pipeline.dataset.order import EpochOrder, as_int
 from levelproof.pipeline.dataset.records import Records, loaded_together
 from levelproof.pipeline.dataset.renamed import renamed
 from levelproof.pipeline.dataset.sources import TrajectorySource
@@ -164,8 +165,8 @@ class Dataset:
             Failure: the data is damaged.
         """
         windows, kind, chosen = Windows.of(length), parse_observation(observation), expand_fields(fields, self.size)
-        indices = np.atleast_1d(whole_numbers(indices, "indices"))
-        starts = np.broadcast_to(whole_numbers(first, "first steps"), indices.shape)
+        indices = in_a_row(indices, "indices")
+        starts = in_a_row(first, "first steps", len(indices))
         require_steps(starts)
         if self._repeats(windows, kind):
             records = Records(windows, chosen, self.rules.max_timesteps)
@@ -221,7 +222,7 @@ class Dataset:
         """
         windows, indices, fields = Windows.of(length), self._subset(subset), expand_fields(fields, self.size)
         order = EpochOrder(len(indices) * windows.per_record, batch_size, seed, process_index, process_count)
-        settings, kind = self._settings(subset=subset, length=length), parse_observation(observation)
+        settings, kind = self._settings(subset=subset, length=as_int(length)), parse_observation(observation)
 
         def read(positions: range) -> list[Batch]:
             items, new = order.items(positions)
@@ -262,7 +263,7 @@ class Dataset:
         """
         kind, chosen = parse_observation(observation), expand_fields(fields, self.size)
         gather = lambda rows: gather_episodes(self.split, rows, chosen, kind, self._shard, self._differing.note)
-        read = self._trajectories.gathered(np.atleast_1d(whole_numbers(indices, "indices")), gather)
+        read = self._trajectories.gathered(in_a_row(indices, "indices"), gather)
         return replace(read, mask=read.mask & self._differing.kept(read.level_id)[read.episode])
 
     def episode_batches(
@@ -329,7 +330,7 @@ class Dataset:
             UserError: an index does not exist.
             Failure: the data is damaged.
         """
-        arrays = self._arrays(np.atleast_1d(whole_numbers(indices, "indices")), expand_fields(["level"], self.size))
+        arrays = self._arrays(in_a_row(indices, "indices"), expand_fields(["level"], self.size))
         return jax.tree.map(lambda x: np.ascontiguousarray(np.moveaxis(x, 0, -1)), tree_of(Level, arrays, "level/"))
 
     @renamed(number="index")

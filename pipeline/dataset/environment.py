@@ -85,8 +85,10 @@ def _of_split(
     resets: tuple[bool, bool],
 ) -> tuple[Environment, EnvParams]:
     """Make an environment of the levels of a split, with the task's rules there if `rules` are None."""
-    manifest = require_manifest(Path(split), ["level_id", *COLUMNS, *columns_in(where)])
-    rows = select(manifest.table, where)
+    # Two steps, because hashes and contents of seeds take time: they are made of the selected levels only
+    chosen = select(require_manifest(Path(split), ["level_id", *columns_in(where)]).table, where)["level_id"]
+    manifest = require_manifest(Path(split), ["level_id", *COLUMNS], chosen.to_numpy())
+    rows = manifest.table
     if not rows.num_rows:
         raise UserError(
             f"The split {split} has no level for which {where} holds: `levelproof inspect {split}` shows its levels."

@@ -38,6 +38,7 @@ from levelproof.pipeline.store.seed.rows import reason_of
 from levelproof.pipeline.store.seed.source import LevelSource
 from levelproof.pipeline.store.seed.worlds import pack_worlds
 from levelproof.pipeline.store.seed.write import seed_bytes
+from levelproof.pipeline.store.shard import refuse_unlike
 from levelproof.pipeline.words import many
 
 READ = (
@@ -136,11 +137,12 @@ def _witnesses(manifest: Manifest, rows: pa.Table) -> tuple[list[bytes], np.ndar
     """Pack the first episodes of rows; return them and their checksums.
 
     Raises:
-        Failure: an episode is not as the manifest says.
+        Failure: an episode is not as the manifest says, or this machine computes other states than the one that made
+            them, of which the checksum must be.
     """
     known = [field.name for field in table_for(size_of(rows["size"][0].as_py()))]
     wanted = [name for name in known if name.startswith(("level/", STATE)) or name in (LAST_DISTANCE, *MOVES)]
-    arrays = read_rows(manifest.split, rows, wanted)
+    arrays = read_rows(manifest.split, rows, wanted, refuse_unlike)
     steps, lanes = rows.column("steps_to_goal").fill_null(0).to_numpy(), np.arange(rows.num_rows)
     done, goal, action = (arrays[name] for name in ("record/done", "record/goal", "record/action"))
     wrong = (steps < 1) | (done.argmax(0) != steps - 1) | ~goal[steps - 1, lanes]

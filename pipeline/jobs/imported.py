@@ -32,7 +32,7 @@ from levelproof.pipeline.read.kinetix.zarr2 import FormatError, StoredArray
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store.job_note import note_job
-from levelproof.pipeline.store.layout import split_path
+from levelproof.pipeline.store.layout import ids_of, split_path
 from levelproof.pipeline.store.manifest import Manifest, any_within, read_manifest
 from levelproof.pipeline.store.origins import Origin, RecordPlace, can_be_noted
 from levelproof.pipeline.store.remote import require_folder
@@ -147,9 +147,9 @@ def _parts(folder: Folder) -> Iterator[UnitOfRows]:
 
 
 def _require_same_folder(folder: Folder, parts: list[UnitOfRows], split: Path) -> None:
-    """Raise UserError if the split has trajectories of another folder at the first ids of its units."""
-    rows = read_manifest(split, ["file"], [part.unit.level_ids[0] for part in parts]).table.to_pylist()
-    files = {row["level_id"]: row["file"] for row in rows}
+    """Raise UserError if the split has trajectories of another folder, or of this one before it changed."""
+    manifest = read_manifest(split, ["level_id", "file"], [part.unit.level_ids[0] for part in parts])
+    files = {row["level_id"]: row["file"] for row in manifest.table.to_pylist()}
     for part in parts:
         wanted = _file(folder, part.array, part.first)
         if (file := files.get(part.unit.level_ids[0], wanted)) != wanted:
@@ -157,6 +157,12 @@ def _require_same_folder(folder: Folder, parts: list[UnitOfRows], split: Path) -
                 f"{split} was imported from another folder (it has {file} instead of {wanted}): one folder makes one "
                 "split, so name a new split with -o."
             )
+    last = {part.unit.level_ids[-1] for part in parts}
+    if changed := [fragment for fragment in manifest.fragments if ids_of(fragment.path)[1] not in last]:
+        raise UserError(
+            f"{folder.path} has other trajectories than when {split} was imported (its unit {changed[0].path.stem} "
+            "ends within one of now): import it elsewhere, with -o."
+        )
 
 
 def _import(

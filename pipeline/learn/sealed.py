@@ -16,7 +16,7 @@ from levelproof.experts.labels import Label
 from levelproof.levelgen.identity.content import DIGITS, VERSION, content_hashes
 from levelproof.levelgen.identity.keys import SAMPLER_VERSION
 from levelproof.levelgen.level import SIZES
-from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.sampling.sampler import on_cpu, sample_levels
 from levelproof.physics.types import Size
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.runtime import cache_folder
@@ -92,7 +92,8 @@ def _kept(name: str) -> list[str]:
         known = json.loads(path.read_text())
         if len(known) == len(SEALED) and all(map(HASH.fullmatch, known)):
             return known
-    hashes = content_hashes(jax.device_get(sample_levels(np.array(SEALED, np.int32), name)))
+    with on_cpu():
+        hashes = content_hashes(jax.device_get(sample_levels(np.array(SEALED, np.int32), name)))
     with suppress(OSError):  # the next command hashes them again
         folder.mkdir(exist_ok=True)
         write(path, json.dumps(hashes).encode())

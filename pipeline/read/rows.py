@@ -18,7 +18,9 @@ COLUMNS = ("level_id", "size", "shard", "row")  # required of rows
 Open = Callable[[Path, str, str], Shard]
 
 
-def read_rows(split: Path, rows: pa.Table, fields: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+def read_rows(
+    split: Path, rows: pa.Table, fields: Iterable[str] | None = None, report: Report = warn_unlike
+) -> dict[str, np.ndarray]:
     """Read arrays of these rows by field name, in row order: level axis last; time first in `record/` fields.
 
     If a seal has moved levels to another shard, rereads the manifest and retries.
@@ -27,14 +29,15 @@ def read_rows(split: Path, rows: pa.Table, fields: Iterable[str] | None = None) 
         split: path or URL of the split.
         rows: manifest rows with at least COLUMNS; at least one row, all with a witness.
         fields: names of the fields to return; None: all.
+        report: called if states differ on this machine from the stored ones.
 
     Raises:
-        Failure: a shard is missing or damaged, or its levels differ from the manifest.
+        Failure: a shard is missing or damaged, or its levels differ from the manifest; or as `report`.
     """
     wanted = None if fields is None else list(fields)
     while True:
         try:
-            arrays = gather_rows(split, rows, wanted)
+            arrays = gather_rows(split, rows, wanted, report=report)
             return {name: np.ascontiguousarray(np.moveaxis(x, 0, -1)) for name, x in arrays.items()}
         except Failure:
             current = current_rows(split, rows)

@@ -105,7 +105,7 @@ def encode_actions(action: Int[np.ndarray, "step 6"], kind: ActionKind) -> Num[n
 @partial(jax.jit, static_argnames="rules")
 def _observe(level: Level, record: Record, rules: TaskParams) -> tuple[Array, Array]:
     """Observe before and after each step, [level, step, feature]; every step is a lane."""
-    lanes = lambda x: jnp.moveaxis(x, 0, -1).reshape(*x.shape[1:-1], -1)
+    lanes = lambda x: jnp.moveaxis(x, 0, -1).reshape(*x.shape[1:-1], x.shape[0] * x.shape[-1])
     repeated = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x), RECORD_STEPS, axis=-1), level)
     state, timestep, last_distance, action = jax.tree.map(
         lanes, (record.state, record.timestep, record.last_distance, record.action)

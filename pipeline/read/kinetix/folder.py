@@ -28,6 +28,7 @@ COUNTED_FIELDS = (
 )  # whose lengths are the fields of Size, in order
 MAX_TRAJECTORIES = 100_000_000  # of a folder; the largest released has 6 million
 INT32 = np.iinfo(np.int32)
+KINDS = {"b": "b", "i": "iu", "f": "f"}  # of a field's type, by that of ours
 
 
 class Trajectories(NamedTuple):
@@ -117,7 +118,7 @@ def _check_fields(array: StoredArray, size: Size) -> None:
         if name not in (array.dtype.names or ()):
             raise FormatError(f"its array {array.path.name} has no field {name}")
         theirs, ours, shape = array.dtype[name], wanted[name].base, wanted[name].shape[1:]
-        if theirs.shape != shape or (theirs.base.kind in "iu") != (ours.kind == "i") or theirs.base.itemsize > 8:
+        if theirs.shape != shape or theirs.base.kind not in KINDS[ours.kind] or theirs.base.itemsize > 8:
             raise FormatError(
                 f"the field {name} of its array {array.path.name} is {theirs.base} of shape {theirs.shape}, "
                 f"but must be {ours} of shape {shape} for levels of size {name_of(size)}"

@@ -100,4 +100,5 @@ def dtype_of(size: Size) -> np.dtype:
 
 def _lanes(tree: T) -> T:
     """Merge the axes level and time into one lane axis, level-major."""
-    return jax.tree.map(lambda x: np.moveaxis(np.asarray(x), 0, -1).reshape(*x.shape[1:-1], -1), tree)
+    merge = lambda x: np.moveaxis(np.asarray(x), 0, -1).reshape(*x.shape[1:-1], x.shape[0] * x.shape[-1])
+    return jax.tree.map(merge, tree)

@@ -80,8 +80,11 @@ class StoredArray:
         """Yield rows `first` to `last - 1` chunk by chunk: first row, first step, and values (row, step).
 
         Raises:
-            FormatError: a chunk is missing or damaged, or its size disagrees with its header.
+            FormatError: there are no such rows; or a chunk is missing or damaged, or its size disagrees with its
+                header.
         """
+        if not 0 <= first < last <= self.rows:
+            raise FormatError(f"its array {self.path.name} has {self.rows:,} rows, so no row {last - 1}")
         rows, steps = self.chunks
         for i, j in product(range(first // rows, -(-last // rows)), range(-(-RECORD_STEPS // steps))):
             low, high = max(first - i * rows, 0), min(last - i * rows, rows)

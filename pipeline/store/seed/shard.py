@@ -169,6 +169,10 @@ def play_seeds(
     wanted = frozenset(name.removeprefix(RECORD) for name in names if name.startswith(RECORD))
     made = play_episodes(level, action, steps, parts[0][0].encoding.rules, wanted, observation)
     rows = {f"{RECORD}{name}": x for name, x in made.fields.items()}
+    is_last = np.zeros(steps.sum(), bool)
+    is_last[np.cumsum(steps) - 1] = True
+    # As stored: if this machine's states differ, an episode may reach its goal at another step, or not at all
+    rows |= {name: is_last for name in (f"{RECORD}done", f"{RECORD}goal") if name in rows}
     wrong = ~made.reaches | (made.checksum != checksum)
     return SeedEpisodes(_of_levels(level, names), steps, rows, made.observation, wrong)
 

@@ -14,7 +14,7 @@ from levelproof.levelgen.batching import block_size, by_blocks
 from levelproof.levelgen.identity.keys import SAMPLER_VERSION
 from levelproof.levelgen.level import Level, size_of
 from levelproof.levelgen.sampling.distribution import Distribution
-from levelproof.levelgen.sampling.sampler import CHUNK, check_size, sample_chunk
+from levelproof.levelgen.sampling.sampler import CHUNK, check_size, on_cpu, sample_chunk
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.types import Size
 from levelproof.pipeline.errors import Failure, UserError
@@ -99,7 +99,8 @@ class LevelSource:
             return unpack_worlds([one for one in content if one is not None], self.size)
         ids = np.asarray(level_ids, np.int32)
         sampled = lambda some: sample_chunk(ids[some], self.size, self.distribution)
-        return by_blocks(sampled, len(ids), block_size(len(ids), CHUNK))
+        with on_cpu():
+            return by_blocks(sampled, len(ids), block_size(len(ids), CHUNK))
 
 
 def without_levels(path: Path) -> UserError:

@@ -68,6 +68,7 @@ def test_batches_resume_from_their_state(data: Dataset) -> None:
     for _ in range(4):
         next(batches)
     state = json.loads(json.dumps(batches.state()))
+    assert json.loads(json.dumps(data.batches(np.int64(8), length=np.int64(64)).state()))["of"]["length"] == 64
     rest = items_of(batches)
     assert items_of(data.batches(8, epochs=3, start=state, **PLAIN)) == rest
     assert rest
@@ -152,6 +153,26 @@ def test_batches_that_cannot_be_finished_end_the_iteration() -> None:
     assert batches.state()["position"] == 2, "the one that failed was not returned"
     with pytest.raises(StopIteration):
         next(batches)
+
+
+def test_batches_before_one_that_cannot_be_loaded_are_returned() -> None:
+    for slowly in (False, True):
+        failed = threading.Event()
+
+        def load(positions: range, failed: threading.Event = failed) -> range:
+            if 2 in positions:
+                failed.set()
+                raise ValueError("damaged")
+            return positions
+
+        batches = Batches(load, None, {}, 4, None)
+        assert next(batches) == 0
+        if slowly:
+            assert failed.wait(patience(10))
+            time.sleep(0.05)
+        assert next(batches) == 1
+        with pytest.raises(ValueError, match="damaged"):
+            next(batches)
 
 
 @pytest.mark.campaign

@@ -243,6 +243,11 @@ def test_open_read_and_state_reject_invalid_arguments(split: Path, tmp_path: Pat
     ):
         with pytest.raises(UserError, match=sentence):
             open(split).read(indices)
+    for read in open(split).read, open(split).levels, open(split).episodes:
+        with pytest.raises(UserError, match=r"The indices have the shape \[1, 2\]: they must have one axis"):
+            read([[0, 1]])
+    with pytest.raises(UserError, match=r"first steps have the shape \[2\]: they must have the shape \[3\]"):
+        open(split).read([0, 1, 0], first=[0, 1])
     for step in (256, -1):
         with pytest.raises(UserError, match=f"There are no steps {step} in a record"):
             open(split).state(0, step)

@@ -15,6 +15,7 @@ from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.exchange.seed import export_seed
 from levelproof.pipeline.store.density import CHECKSUM
+from levelproof.pipeline.store.seed.packed import pack_witness
 from levelproof.pipeline.store.shard import Shard
 from tests.pipeline.made import honest_split
 from tests.pipeline.store.test_density import changed
@@ -163,6 +164,32 @@ def test_warnings_that_are_errors_are_raised_each_time(source: Path) -> None:
         for _ in range(2):
             with pytest.raises(levelproof.EngineDiffers):
                 data.read([1], observation=None)
+
+
+def test_episodes_of_seeds_end_where_they_were_stored_to_end(honest: Path, tmp_path: Path) -> None:
+    """Even if no state here reaches the goal, rows after the last one are of the next episode."""
+    export_seed(honest, None, tmp_path / "good.parquet")
+    table = pq.read_table(tmp_path / "good.parquet")
+    asleep = [
+        None if steps is None else pack_witness(np.zeros((steps, 6), np.int8), np.zeros(6, bool))
+        for steps in table["steps_to_goal"].to_pylist()
+    ]
+    data = levelproof.open(rewritten(tmp_path / "good.parquet", tmp_path / "asleep.parquet", witness=asleep))
+    steps = data.manifest["steps_to_goal"].to_numpy()
+    with pytest.warns(levelproof.EngineDiffers):
+        batch = data.read(np.arange(len(data)), observation=None)
+    assert (batch.reward.max(1) < 0.5).any(), "some do not reach it"
+    ends = (np.arange(256) + 1) % steps[:, None] == 0
+    assert np.array_equal(batch.done, ends)
+    assert np.array_equal(batch.terminated, ends)
+    assert not batch.truncated.any()
+
+
+def test_seeds_are_not_made_of_states_that_differ(shards: Path, ids: list[int], tmp_path: Path) -> None:
+    with pytest.raises(Failure, match="read it with the machine and versions that made it"):
+        export_seed(shards, None, tmp_path / "seeds.parquet")
+    assert not (tmp_path / "seeds.parquet").exists()
+    export_seed(shards, f"level_id NOT IN ({ids[0]}, {ids[1]})", tmp_path / "seeds.parquet")
 
 
 def test_open_refuses_another_way(seeds: Path) -> None:

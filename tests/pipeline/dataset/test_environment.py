@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 import levelproof
+from levelproof.levelgen.identity.content import content_hashes
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.store.manifest import read_manifest
+from levelproof.pipeline.store.seed import rows
+from tests.pipeline.command import ROOT
 
 
 def test_make_uses_all_levels_and_the_rules_of_a_split(split: Path) -> None:
@@ -41,6 +44,16 @@ def test_make_selects_levels_by_a_condition(split: Path) -> None:
     jax.tree.map(np.testing.assert_array_equal, params.levels, data.levels(np.arange(len(data))))
     _, state = jax.eval_shape(env.reset, jax.random.key(0), params)
     assert state.level_index.shape == ()
+
+
+def test_make_hashes_only_the_selected_levels_of_seeds(monkeypatch: pytest.MonkeyPatch) -> None:
+    hashed = list[int]()
+    counted = lambda level: hashed.append(level.role.shape[-1]) or content_hashes(level)
+    monkeypatch.setattr(rows, "content_hashes", counted)
+    env, _ = levelproof.make(split=ROOT / "manifests/256k/s", where="level_id < 10")
+    assert env.level_ids is not None
+    assert env.level_ids.tolist() == [*range(10)]
+    assert sum(hashed) <= 16
 
 
 def test_make_rejects_invalid_arguments(split: Path, tmp_path: Path) -> None:

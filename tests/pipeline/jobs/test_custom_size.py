@@ -44,11 +44,16 @@ def test_manifest_names_size_and_distribution(made: Path, capsys: pytest.Capture
 
 
 @pytest.mark.parametrize("size", ["4-2-0-1", "6-0-1-1", "5-2-1-0"])
-def test_sizes_without_joints_thrusters_or_circles_generate_and_verify(tmp_path: Path, size: str) -> None:
+def test_sizes_without_joints_thrusters_or_circles_generate_verify_and_export(tmp_path: Path, size: str) -> None:
     done = here(["generate", f"size={size}", "levels=4", "unit=4", "budget=5k", "executor=inline"], tmp_path)
     assert done.returncode == 0, done.stderr
     done = here(["verify", f"data/5k/{size}"], tmp_path)
     assert done.returncode == 0, done.stdout
+    for kind in "kinetix", "minari":
+        done = here(["export", f"data/5k/{size}", "--format", kind, "-o", kind], tmp_path)
+        assert done.returncode == 0, done.stderr
+    done = here(["import", "kinetix", "-o", f"again/5k/{size}"], tmp_path)
+    assert done.returncode == 0, done.stderr
 
 
 def test_commands_work_on_a_custom_size(made: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -181,6 +181,26 @@ def test_import_continues_after_a_stop(
     assert [[row[name] for name in same] for row in got] == [[row[name] for name in same] for row in want]
 
 
+def test_import_of_a_folder_that_has_grown_is_refused(
+    once: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rows were added to its last array since: the unit that ends with it would count as done."""
+    fewer = Path(shutil.copytree(once / "theirs", tmp_path / "theirs"))
+    about = json.loads((fewer / "second/.zarray").read_text())
+    (fewer / "second/.zarray").write_text(json.dumps(about | {"shape": [about["shape"][0] - 1, 256]}))
+    assert here(["import", "theirs", "-o", "data/1M/s"], tmp_path).returncode == 0
+    (fewer / "second/.zarray").write_text(json.dumps(about))
+    done = here(["import", "theirs", "-o", "data/1M/s"], tmp_path)
+    assert_refused(done, 2, "theirs has other trajectories than when data/1M/s was imported", "import it elsewhere")
+
+
+def test_a_row_that_an_array_lacks_is_no_level(once: Path, tmp_path: Path) -> None:
+    words = ["generate", f"level_files={once}/theirs/second#{ROWS}", "budget=5k", "executor=inline"]
+    done = here(words, tmp_path)
+    assert_refused(done, 2, "can be used")
+    assert f"its array second has {ROWS - ROWS // 2} rows, so no row {ROWS}" in done.stderr
+
+
 def test_regenerate_names_a_missing_folder(folder: Path) -> None:
     moved = folder / "moved"
     shutil.copytree(folder, moved)

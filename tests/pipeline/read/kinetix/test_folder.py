@@ -124,6 +124,14 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], str]] = {
         fields(lambda dtype: next(x for x in dtype if x[0] == "action").__setitem__(1, "<f4")),
         "the field action of its array first is float32 of shape (6,), but must be int32",
     ),
+    "floats as flags": (
+        fields(lambda dtype: next(x for x in dtype if x[0] == "env_state/joint/active").__setitem__(1, "<f4")),
+        "the field env_state/joint/active of its array first is float32 of shape (1,), but must be bool",
+    ),
+    "flags as floats": (
+        fields(lambda dtype: next(x for x in dtype if x[0] == "env_state/polygon/position").__setitem__(1, "|b1")),
+        "the field env_state/polygon/position of its array first is bool",
+    ),
     "no size": (fields(lambda dtype: dtype.__setitem__(slice(None), SIZE)), "do not match any level size"),
     "missing": (lambda folder: (folder / "first/0.0").unlink(), "0.0 is missing"),
     "a pipe": (pipe, "0.0 is missing"),
