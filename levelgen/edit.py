@@ -236,8 +236,11 @@ def _edited(level: Level, change: Callable[[Level], None]) -> Level:
     one = one_of(level)
     change(one)
     after: Level = jax.tree.map(lambda x: np.asarray(x)[..., None], one)
-    bodies = one.state.position[FIXED_POLYGONS:][one.model.active[FIXED_POLYGONS:]]
-    if not np.isfinite(after.state.position).all() or np.abs(bodies).max(initial=0) > 2 * WORLD_SIDE:
+    before = one_of(level)
+    placed = (one.state.position != before.state.position).any(-1) | ~before.model.active  # moved or added
+    placed &= one.model.active & (np.arange(len(placed)) >= FIXED_POLYGONS)
+    far = np.abs(one.state.position[placed]).max(initial=0) > 2 * WORLD_SIDE
+    if far or not np.isfinite(after.state.position).all():
         raise EditError(
             "A body would lie too far outside the world: "
             f"keep its coordinates between {-2 * WORLD_SIDE:g} and {2 * WORLD_SIDE:g} m."

@@ -13,9 +13,12 @@ SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
 def require_known(path: Path) -> None:
     """Raise UserError for a URL of an unsupported scheme, which would otherwise be taken for a folder."""
     first = path.parts[0] if path.parts else ""
-    if SCHEME.match(first) and first not in (*BUCKETS, *WEB, *HUB):
+    if SCHEME.match(first) and first not in (*BUCKETS, *WEB, *HUB) and not Path(first).exists():
         known = ", ".join(f"{scheme}//" for scheme in (*BUCKETS, *WEB, *HUB))
-        raise UserError(f"{path} looks like a URL of an unknown scheme: give a folder, or a URL of {known}.")
+        raise UserError(
+            f"{path} looks like a URL of an unknown scheme: give a folder (by its absolute path if its name has a "
+            f"colon), or a URL of {known}."
+        )
 
 
 def require_here(path: Path) -> None:

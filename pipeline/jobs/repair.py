@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 from rich.console import Console
 
@@ -15,7 +16,7 @@ from levelproof.configs.schema import JobConfig, from_files, hash_of
 from levelproof.pipeline.errors import Exit, Failure, UserError
 from levelproof.pipeline.jobs.generate import generate
 from levelproof.pipeline.jobs.progress import say
-from levelproof.pipeline.runtime import in_another_process
+from levelproof.pipeline.runtime import in_another_process, own_cores
 from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store.job_note import note_job, sound_note
 from levelproof.pipeline.store.layout import EXPERTS, data_paths, fragment_files
@@ -53,10 +54,10 @@ def repair(split: Path, settings: Sequence[str], console: Console) -> Exit:
         raise UserError(
             f"A repair uses the settings of its split: leave out {wrong[0]}; {', '.join(SETTINGS)} may change."
         )
-    compose_job(settings)  # raises ConfigError for the user's own mistakes, before anything takes time
+    how = compose_job(settings)  # raises ConfigError for the user's own mistakes, before anything takes time
     if is_written(split):
         raise UserError(f"Another levelproof command is writing to {split}: wait for it, or stop it first.")
-    findings = _examine_split(split, inline="executor=inline" in settings)
+    findings = _examine_split(split, how)
     print(findings.report(split))
     if not findings.wrong:
         return Exit.DONE
@@ -82,15 +83,20 @@ def repair(split: Path, settings: Sequence[str], console: Console) -> Exit:
     return Exit.FAILED if left else code
 
 
-def _examine_split(split: Path, inline: bool) -> Findings:
-    """Examine the split; if Ray will fork this process, which must not have started JAX before, in another process."""
-    return _examine(split) if inline else in_another_process(_examine, split)
+def _examine_split(split: Path, job: JobConfig) -> Findings:
+    """Examine the split on the device that would make its lost levels again: it finds those that another one made.
+
+    In another process if Ray will fork this one, which must not have started JAX before.
+    """
+    if job.executor == "inline":
+        return _examine(split, job.device, len(own_cores()))
+    return in_another_process(_examine, split, job.device)
 
 
-def _examine(split: Path) -> Findings:
+def _examine(split: Path, device: Literal["cpu", "gpu"], threads: int = 1) -> Findings:
     from levelproof.pipeline.verify.verify import examine  # starts JAX
 
-    return examine(split, Console(stderr=True))
+    return examine(split, Console(stderr=True), device, threads)
 
 
 def _require_as_examined(split: Path, findings: Findings) -> None:

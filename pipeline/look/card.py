@@ -5,6 +5,7 @@ only the licence must be chosen by a person.
 """
 
 import io
+import os
 import shlex
 from collections.abc import Iterable, Sequence
 from itertools import chain
@@ -99,7 +100,7 @@ def _above(split: Path) -> Path:
     if is_remote(split):
         above = split.parent if is_seed(split) else split.parent.parent
         return Path(*split.parts[:HUB_PARTS]) if split.parts[0] in HUB else above
-    whole = split.absolute()
+    whole = Path(os.path.abspath(split))  # without `..`
     return whole.parent.parent if whole.is_dir() else whole.parent
 
 

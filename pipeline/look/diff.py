@@ -59,6 +59,7 @@ def compare(one: Path, other: Path, where: str | None = None, rows: int = 10) ->
     totals = [sum(steps.values()) if steps else 0 for steps in spent]
     costs = [cost.cost_of(side) for side in (left, right)]
     seconds = [sum(side["seconds"].values()) if side else 0.0 for side in costs]
+    alike = all(costs) and len({(side["of"], side["levels"]) for side in costs if side}) == 1
     counts = [[int(mask.sum()) for mask in (side & tried, tried)] for side in solved]
     return {
         "splits": [as_typed(one), as_typed(other)],
@@ -78,7 +79,7 @@ def compare(one: Path, other: Path, where: str | None = None, rows: int = 10) ->
         "env_steps": spent,
         "env_steps_for_one_more": (totals[1] - totals[0]) / gained if gained and all(spent) else None,
         "cost": costs,
-        "seconds_for_one_more": (seconds[1] - seconds[0]) / gained if gained and all(costs) else None,
+        "seconds_for_one_more": (seconds[1] - seconds[0]) / gained if gained and alike else None,
         "steps_to_goal": _paired(left, right, solved[0] & solved[1]),
     }
 
@@ -170,7 +171,7 @@ def _print(facts: dict[str, Any], console: Console) -> None:
         here, there = (side[name] for side in facts["env_steps"])
         if here or there:
             table.add_row(name.replace("_", " "), f"{here:,}", f"{there:,}", f"{there - here:+,}")
-    if all(facts["cost"]) and len({cost["of"] for cost in facts["cost"]}) == 1:
+    if all(facts["cost"]) and len({(cost["of"], cost["levels"]) for cost in facts["cost"]}) == 1:
         here, there = (sum(side["seconds"].values()) for side in facts["cost"])
         table.add_row(f"{facts['cost'][0]['of']}-seconds", f"{here:,.0f}", f"{there:,.0f}", f"{there - here:+,.0f}")
     if steps := facts["steps_to_goal"]:

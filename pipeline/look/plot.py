@@ -33,8 +33,10 @@ def plot(split: Path, query: RowQuery, out: Path) -> None:
     if out.suffix.lower() not in KINDS:
         raise UserError(f"Cannot draw to {out}: its name must end in {' or '.join(KINDS)}.")
     prepare_for_seeds(split)
-    table = select(require_manifest(split, ["label", *NUMBERS, *columns_in(query.where)]).table, query.where)
-    values = {name.replace("_", " "): table[name].drop_null().to_numpy() for name in NUMBERS}
+    manifest = require_manifest(split, ["label", *NUMBERS, *columns_in(query.where)])
+    table = select(manifest.table, query.where)
+    numbers = [name for name in NUMBERS if not (name == "env_steps" and manifest.repeats)]  # seeds leave costs behind
+    values = {name.replace("_", " "): table[name].drop_null().to_numpy() for name in numbers}
     values = {name: column[~np.isnan(column)] for name, column in values.items()}
     values = {name: column for name, column in values.items() if len(column)}
     drawn = {label: _curves(split, table, label) for label in sorted(TRAINED)}

@@ -33,7 +33,7 @@ def play(
             port is invalid or taken.
         Failure: the split is damaged.
     """
-    prepare_jax()
+    prepare_jax(threads=2)  # an expert may train while the page plays
     procedure, env_steps = Procedure(), parse_count(budget, "budget")
     try:
         check_budget(env_steps, procedure.expert, procedure.stop)

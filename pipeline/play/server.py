@@ -33,6 +33,7 @@ SHARED = ("draw.js", "curve.js", "focus.js", "style.css")  # files shared with t
 PALETTE = "palette.css"
 MAX_BYTES = 8_000_000  # of a request, which may contain a level file
 SOCKET = "/socket"
+HTTP_PORT = 80
 
 
 @contextmanager
@@ -141,7 +142,10 @@ class PageConnection:
 def _file(connection: ServerConnection, request: Request) -> Response | None:
     """Answer a request for a file; None continues with the websocket. Refuses other hosts and origins."""
     port = connection.socket.getsockname()[1]
-    hosts = {f"{name}:{port}" for name in (HOST, "localhost")}
+    names = HOST, "localhost"
+    hosts = {f"{name}:{port}" for name in names} | (
+        {*names} if port == HTTP_PORT else set()
+    )  # browsers omit the default
     if request.headers.get("Host") not in hosts:
         return connection.respond(HTTPStatus.FORBIDDEN, "This server serves only this machine.\n")
     if request.path == SOCKET:

@@ -26,10 +26,13 @@ def examine_seeds(source: Path, console: Console | None) -> Findings:
         Failure: this program makes other levels from their ids, or they mix several configurations.
     """
     findings, files = Findings(stored=STORED), seed_files(source)
-    findings.config = read_manifest(source, []).config
     whole = [path for path in files if has_own(path)]
     for path in sorted({*files} - {*whole}):
         findings.add(f"The seed file {path} is not what was written: its bytes have changed.", [])
+    if len(whole) == len(files):
+        findings.config = read_manifest(source, []).config  # raises if they mix several configurations
+    elif whole:
+        findings.config = read_seed(whole[0], [])[0].fragment.config
     with ProgressBar("levels", sum(read_seed(path, [])[0].fragment.rows for path in whole), console) as progress:
         for path in whole:
             _examine_file(path, findings, progress)

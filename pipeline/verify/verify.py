@@ -13,7 +13,7 @@ from contextlib import suppress
 from itertools import islice
 from os import DirEntry
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -88,13 +88,15 @@ def verify(split: Path, as_json: bool, console: Console) -> Exit:
     return Exit.FAILED if findings.wrong else Exit.DONE
 
 
-def examine(split: Path, console: Console | None = None) -> Findings:
-    """Check every file, row and shard of a split; show progress on `console`.
+def examine(
+    split: Path, console: Console | None = None, device: Literal["cpu", "gpu"] | None = None, threads: int = 1
+) -> Findings:
+    """Check every file, row and shard of a split; show progress on `console`. `device` and `threads`: of `prepare_jax`.
 
     Raises:
         UserError, Failure: as `verify`.
     """
-    prepare_jax()
+    prepare_jax(device=device, threads=threads)
     if is_seed(split):
         return examine_seeds(split, console)
     findings = _examine_once(split, console)

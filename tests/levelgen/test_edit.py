@@ -144,6 +144,17 @@ def test_impossible_edit_raises_one_sentence(edit, words: str) -> None:
     assert str(error.value).endswith(".")
 
 
+def test_edits_leave_a_distant_body_where_it_is() -> None:
+    """A level file may have one; only where an edit puts a body is limited."""
+    level = add_body(empty(), "rectangle", 2, 2)
+    level.state.position[FIRST, 0] = 12
+    assert one_of(set_role(level, FIRST, Role.BLUE)).role[FIRST] == Role.BLUE
+    assert one_of(add_body(level, "circle", 1, 1)).model.active[M.polygons]
+    with pytest.raises(EditError, match="outside"):
+        move(level, FIRST, 11, 2)
+    assert one_of(move(level, FIRST, 2, 2)).state.position[FIRST, 0] == 2
+
+
 def test_new_joint_has_no_impulse_of_a_deleted_one() -> None:
     level = joined()
     level.state.joint_impulse[:], level.state.joint_angular_impulse[:] = 3.0, 2.0

@@ -206,6 +206,16 @@ def test_repair_reports_and_keeps_levels_of_another_stack(copied: Callable[[Path
     assert data_files(split) == before
 
 
+@pytest.mark.parametrize(("words", "device"), [([], "cpu"), (["device=gpu"], "gpu")])
+def test_repair_examines_on_the_device_that_makes_what_is_lost(
+    words: list[str], device: str, whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+    monkeypatch.setattr(repairing, "in_another_process", lambda function, *given: asked.append(given) or examine(whole))
+    assert repairing.repair(whole, words, Console(stderr=True)) == 0
+    assert asked == [(whole, device)]
+
+
 @pytest.mark.parametrize("word", ["size=m", "budget=1M", "out=x", "nonsense"])
 def test_repair_rejects_settings_that_decide_results(word: str, tmp_path: Path) -> None:
     done = here(["verify", str(tmp_path), "--repair", word], tmp_path)

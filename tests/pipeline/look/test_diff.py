@@ -13,6 +13,7 @@ from levelproof.pipeline.dataset.sample import SAMPLE
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import commit
+from levelproof.pipeline.look import cost
 from levelproof.pipeline.look.diff import compare, diff, exact_p
 from levelproof.pipeline.store.layout import split_path
 from tests.pipeline.made import made_job, made_result, made_split
@@ -64,6 +65,15 @@ def test_compare_prices_each_extra_solved_level(splits: tuple[Path, Path]) -> No
     assert facts["seconds_for_one_more"] == pytest.approx(-14, abs=1)  # plus the time of writing
     assert facts["steps_to_goal"]["shorter"] == facts["steps_to_goal"]["levels"] == 2
     assert facts["steps_to_goal"]["median_change"] == -1
+
+
+def test_seconds_of_cores_and_gpus_are_not_subtracted(
+    splits: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kinds = iter(("core", "GPU"))
+    monkeypatch.setattr(cost, "cost_of", lambda rows, known=cost.cost_of: known(rows) | {"of": next(kinds)})
+    diff(*splits, None, 1, as_json=False)
+    assert "seconds" not in capsys.readouterr().out
 
 
 @pytest.mark.slow

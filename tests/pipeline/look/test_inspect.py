@@ -18,6 +18,7 @@ from levelproof.experts.labels import Cause, Label, unsolved_reason
 from levelproof.levelgen.identity.keys import SAMPLER_VERSION
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.pipeline.dataset.sample import SAMPLE
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import commit
@@ -188,6 +189,8 @@ def test_plot_draws_histograms_and_curves(
     else:
         with Image.open(tmp_path / name) as picture:
             assert picture.width > 1000
+    plot(SAMPLE, RowQuery(where="level_id < 20"), tmp_path / name)
+    assert "env steps" not in capsys.readouterr().out, "seeds leave costs behind"
     with pytest.raises(UserError, match=r"must end in \.svg or \.png"):
         plot(split, RowQuery(), tmp_path / "split.pdf")
     with pytest.raises(UserError, match="nothing to draw"):

@@ -86,8 +86,8 @@ def test_command_serves_a_level_until_ctrl_c(split: Path, tmp_path: Path) -> Non
         with connect(f"{found[0].replace('http', 'ws')}/socket", origin=Origin(found[0]), max_size=2**26) as page:
             assert ask(page, "play")["actions"] == witness.tolist()
             assert ask(page, "attempt")["actions"], "by the policy that comes with levelproof"
-        process.send_signal(signal.SIGINT)
-        out, err = process.communicate(timeout=patience(ANSWER_SECONDS))
+            process.send_signal(signal.SIGINT)  # while the page is open
+            out, err = process.communicate(timeout=patience(ANSWER_SECONDS))
     finally:
         process.kill()
     assert (process.returncode, err) == (0, "")

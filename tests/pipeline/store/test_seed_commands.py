@@ -92,6 +92,16 @@ def test_verify_finds_no_fault_in_a_seed_file_and_every_change_of_its_bytes(seed
         assert sentence == f"The seed file {changed} is not what was written: its bytes have changed."
 
 
+def test_verify_of_a_folder_names_a_cut_off_file_and_examines_the_others(seed: Path, tmp_path: Path) -> None:
+    (tmp_path / "a.parquet").write_bytes(seed.read_bytes()[:-100])
+    shutil.copy(seed, tmp_path / "b.parquet")
+    findings = examine(tmp_path)
+    assert list(findings.wrong) == [
+        f"The seed file {tmp_path / 'a.parquet'} is not what was written: its bytes have changed."
+    ]
+    assert findings.levels == 16
+
+
 def test_verify_names_the_level_of_a_changed_checksum_or_witness(seed: Path, tmp_path: Path) -> None:
     row = solved(seed)
 
