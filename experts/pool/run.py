@@ -219,8 +219,10 @@ class TrainingRun:
         record = jax.tree.map(lambda x: np.where(witnessed, x, np.zeros_like(x)), record)
         ended = zip(level_ids[left].tolist(), trained, strict=True)
         experts = {level_id: level.expert for level_id, level in ended if level.expert is not None}
-        result = UnitResult(level_ids, levels, record, known, spent_on(known, submission, config), experts)
-        return result, reworking
+        here = set(level_ids.tolist())
+        earlier = [paused for level_id, paused in self._paused.items() if level_id in here]
+        spent = spent_on(known, submission, config, earlier)
+        return UnitResult(level_ids, levels, record, known, spent, experts), reworking
 
     def _some(self, indices: Int[np.ndarray, " index"]) -> tuple[Level, Int[np.ndarray, " index"]]:
         return take(self.levels, indices), self.level_ids[indices]
@@ -259,12 +261,15 @@ def idling(verdict: Verdict, nothing: Int[np.ndarray, "256 6"]) -> Sequence[Witn
     return () if steps is None else (Witness(nothing, Source.NOTHING, steps),)
 
 
-def spent_on(verdicts: list[Verdict], submission: TrainingJob, config: ExpertConfig) -> EnvSteps:
-    """Sum the env steps of levels, and of empty slots."""
+def spent_on(
+    verdicts: list[Verdict], submission: TrainingJob, config: ExpertConfig, earlier: Sequence[Paused]
+) -> EnvSteps:
+    """Sum the env steps of levels, and of empty slots, without those that `earlier` processes took."""
     total = lambda name: sum(getattr(verdict, name) for verdict in verdicts)
+    evaluated = sum(paused.evaluated_rollouts for paused in earlier)
     return EnvSteps(
-        total("search_steps"),
+        total("search_steps") - sum(int(paused.found.search_steps.sum()) for paused in earlier),
         submission.trained_rollouts * config.steps_per_update,
-        total("evaluation_steps"),
+        total("evaluation_steps") - evaluated * config.steps_per_update,
         submission.idle_rollouts * config.steps_per_update,
     )

@@ -9,6 +9,7 @@ from levelproof.pipeline.runtime import own_cores
 
 MANY = 16  # levels; a job of fewer may compile programs that it does not use, and leave slots of its programs empty
 MAX_THREADS = 6  # workers in one process: Python, unlike compiled code, runs in one thread at a time
+PARTS = 4  # of an untimed work unit; a worker of fewer levels would leave most of its slots empty
 SMALL = 2  # untimed work units; a process makes them in the time in which Ray and its workers start
 DEFAULT_BUDGET = parse_count(JobConfig.budget, "budget")  # env steps; the search, which it does not limit, takes longer
 
@@ -29,6 +30,16 @@ def runs_here(job: JobConfig, levels: int) -> bool:
     # To grow a level costs the same whatever its expert's budget was
     budget = DEFAULT_BUDGET if isinstance(job, GrowConfig) else max(job.env_steps, DEFAULT_BUDGET)
     return levels * budget <= SMALL * unit * DEFAULT_BUDGET
+
+
+def most_workers(job: JobConfig, levels: int) -> int:
+    """Return the number of Ray workers that a job can use: `job.workers`, or fewer if it has few levels.
+
+    Each gets a work unit; units that are sized by time are smaller where there are more workers.
+    """
+    each = job.unit or max(1, job.levels_per_unit // PARTS)
+    occupied = -(-levels // each)
+    return max(1, min(job.workers or occupied, occupied))
 
 
 def workers_here(job: JobConfig, levels: int) -> int:

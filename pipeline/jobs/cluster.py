@@ -32,6 +32,7 @@ from levelproof.levelgen.level import size_of
 from levelproof.pipeline.errors import Failure, last_line
 from levelproof.pipeline.jobs.actor import WorkerActor
 from levelproof.pipeline.jobs.address import cannot_start, noticing_slow_starts, ray_address, require_reachable
+from levelproof.pipeline.jobs.choice import most_workers
 from levelproof.pipeline.jobs.likeness import program_of, with_absolute_paths
 from levelproof.pipeline.jobs.places import bytes_of_worker, memory_to_reserve, shortage, workers_by_machine
 from levelproof.pipeline.jobs.progress import STOPPING, Board, Meters
@@ -134,11 +135,10 @@ class Crew:
         self._gpus = job.device == "gpu" and not why
         self._job = replace(job, device="gpu" if self._gpus else "cpu")
         self._split, self._scheduler, self._board, self._writer = split, scheduler, board, writer
-        units = -(-scheduler.waiting // job.levels_per_unit)
-        self._most = max(1, min(job.workers or units, units))
+        self._most = most_workers(job, scheduler.waiting)
         self._kind, self._memory = "GPU" if self._gpus else "CPU", bytes_of_worker(size_of(job.size))
         self._handles: list[WorkerHandle] = []
-        self._refused: set[str] = set()  # machines with another program
+        self._refused: set[str] = set()  # machines with another program, or that do not see the split
         self._short: set[str] = set()  # machines whose lack of memory has been reported
         self._given_up: Counter[str] = Counter()  # number of workers that cannot start, by machine
         self._started = 0
@@ -283,7 +283,7 @@ class Crew:
         self._scheduler.leave(handle)
 
     def _refuse(self, handle: WorkerHandle, why: str) -> None:
-        """Exclude a machine, because it has another program.
+        """Exclude a machine, because it has another program or does not see the split.
 
         Raises:
             Failure: no other worker is left.

@@ -1,4 +1,4 @@
-"""Checking that a worker runs the driver's program: only then do its levels equal those of any other worker."""
+"""Checking that a worker runs the driver's program, as its levels must equal any other's, and sees its split."""
 
 import hashlib
 import socket
@@ -7,8 +7,9 @@ from functools import cache
 from pathlib import Path
 
 from levelproof.configs.schema import JobConfig
+from levelproof.pipeline.store.leases import is_written_by
 from levelproof.pipeline.store.provenance import versions
-from levelproof.pipeline.store.remote import absolute, as_typed
+from levelproof.pipeline.store.remote import absolute, as_typed, is_remote
 
 Program = dict[str, str]  # versions by name
 COMPARED = ("levelproof", "jax", "jaxlib", "sampler")  # names in `provenance.versions`
@@ -31,6 +32,16 @@ def mismatch(program: Program, job: JobConfig) -> str:
                 f"{there}: install the same levelproof there, start its Ray again, and run the same command."
             )
     return ""
+
+
+def unseen(split: Path, writer: str) -> str:
+    """Return a sentence if this machine does not see the folder in which the driver is the writer; empty: it does."""
+    if not writer or is_remote(split) or is_written_by(split, writer):
+        return ""
+    return (
+        f"The worker on {socket.gethostname()} does not see {split} as this command does: use a folder that all "
+        "machines share, or the URL of an object store, as out."
+    )
 
 
 def with_absolute_paths(job: JobConfig) -> JobConfig:

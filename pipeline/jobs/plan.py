@@ -19,7 +19,7 @@ from levelproof.experts.labels import WITNESSED, Label
 from levelproof.experts.steps import Seconds
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs.address import on_this_machine
-from levelproof.pipeline.jobs.choice import runs_here, workers_here
+from levelproof.pipeline.jobs.choice import most_workers, runs_here, workers_here
 from levelproof.pipeline.jobs.forecast import LIKELY, Forecast, PerWitness, Sample, forecast
 from levelproof.pipeline.jobs.generate import generate
 from levelproof.pipeline.jobs.progress import say
@@ -50,7 +50,9 @@ def plan(job: JobConfig, as_json: bool, console: Console) -> None:
         raise UserError("plan is for random levels: for level files, `generate` a few and `inspect` their costs.")
     with on_this_machine():
         sample = measure(job, console)
-    cost = forecast(sample, len(job.level_ids), job.workers or sample.workers, job.levels_per_unit, job.unit)
+    count = len(job.level_ids)
+    workers = min(job.workers or sample.workers, most_workers(job, count))
+    cost = forecast(sample, count, workers, job.levels_per_unit, job.unit)
     if as_json:
         basis = {"levels": len(sample.busy), "workers": sample.workers, "wall": sample.wall, "once": sample.once}
         print(json.dumps(cost.as_json() | {"device": sample.device, "sample": basis, "likely": LIKELY}, indent=2))
@@ -101,14 +103,14 @@ def measure(job: JobConfig, console: Console, seconds: float = SECONDS) -> Sampl
         if count > some:
             wall = _make(job, folder, count, here)
         table, busy, compiling = costs_of(split)
-        new = busy[some:] if count > some else busy
+        new, compiled = (busy[some:], 0.0) if count > some else (busy, compiling.sum())
         labels = np.array(table.column("label").to_pylist())
         prepare_jax()
         return Sample(
             device="GPU" if not table.column("device")[0].as_py().startswith("cpu") else "core",
             workers=here,
             wall=time.monotonic() - begun,
-            once=max(0.0, wall - new.sum() / here),
+            once=max(0.0, wall - (new.sum() + compiled) / here),
             compiling=compiling[:some].sum() / here,
             busy=busy,
             solved=labels == Label.SOLVED,

@@ -123,7 +123,7 @@ DESCRIBED = (
         pa.float32(),
         "Witness replays from starts differing by rounding that reach the goal",
         "share",
-        f"{NO_WITNESS}, or `expert.replays=0`",
+        f"{NO_WITNESS}, an imported one, or `expert.replays=0`",
     ),
     ManifestColumn(
         "steps_to_first_success",

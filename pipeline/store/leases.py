@@ -225,6 +225,11 @@ def _taken(path: Path, text: bytes, say: Callable[[str], None]) -> Version:
         time.sleep(POLL)
 
 
+def is_written_by(split: Path, writer: str) -> bool:
+    """Whether this machine sees that a split's current or last writer has this token."""
+    return _writer(split) == writer
+
+
 def _writer(split: Path) -> str:
     """Return the token of a split's current or last writer; empty: none."""
     path = split / WRITER_LOCK

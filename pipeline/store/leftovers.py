@@ -24,7 +24,7 @@ from levelproof.pipeline.store.locks import without_commits
 from levelproof.pipeline.store.manifest import DATA_COLUMNS, Manifest, data_named_by, read_fragment, read_manifest
 from levelproof.pipeline.store.objects import put
 from levelproof.pipeline.store.publish import OVER, ended
-from levelproof.pipeline.store.remote import is_remote
+from levelproof.pipeline.store.remote import as_typed, is_remote
 
 
 def clean(split: Path, say: Callable[[str], None]) -> Manifest:
@@ -38,6 +38,8 @@ def clean(split: Path, say: Callable[[str], None]) -> Manifest:
         LockRefused: the file system has no locks.
     """
     with without_commits(split, say):
+        # Before the manifest: in a store, an earlier writer's worker may commit in between, and remove its mark
+        begun = entries(split, MANIFEST, BEGUN, DirEntry.is_file)
         manifest = read_manifest(split, ["label", *DATA_COLUMNS], compact=True)
         named = manifest.shards | manifest.named["experts"]
         for fragment in manifest.superseded:
@@ -45,7 +47,6 @@ def clean(split: Path, say: Callable[[str], None]) -> Manifest:
             disown(data_path(split, name) for name in theirs - named)
             remove(fragment.path)
         unnamed = [path for path in data_paths(split) if path.relative_to(split).as_posix() not in named]
-        begun = entries(split, MANIFEST, BEGUN, DirEntry.is_file)
         over = begun.keys()
         if is_remote(split):
             over = ended(split, begun, named)
@@ -59,7 +60,8 @@ def clean(split: Path, say: Callable[[str], None]) -> Manifest:
             remove(path)
     if kept := sorted(path for path in set(unnamed) - set(dead) if begun_path(path) not in begun):
         more = f" and {len(kept) - 1} more like it" if kept[1:] else ""
-        say(f"No fragment names {kept[0]}{more}: delete this data, unless a fragment that you keep elsewhere names it.")
+        data = f"{as_typed(kept[0])}{more}"
+        say(f"No fragment names {data}: delete this data, unless a fragment that you keep elsewhere names it.")
     return manifest
 
 

@@ -1,6 +1,8 @@
 """Submissions that share a pool: each gets the results that it would get alone, whenever it arrives."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import numpy as np
@@ -9,6 +11,8 @@ import pytest
 from levelproof.experts.pool.found import nothing_found
 from levelproof.experts.pool.paused import Paused
 from levelproof.experts.pool.pool import GROUP, Pool, TrainingJob
+from levelproof.experts.pool.run import spent_on
+from levelproof.experts.steps import EnvSteps
 from levelproof.experts.training.slots import Pending, begin
 from levelproof.experts.verdict.judge import KeptExpert, TrainedLevel, Witness
 from levelproof.experts.verdict.portability import PORTABLE, choose
@@ -256,3 +260,11 @@ def test_slow_level_keeps_no_slot_empty(levels: Level) -> None:
         assert pool.step() == []
     assert 0 in submission.under_way
     assert submission.idle_rollouts == 0
+
+
+def test_env_steps_of_earlier_processes_are_not_counted_again() -> None:
+    verdicts: Any = [SimpleNamespace(search_steps=steps, evaluation_steps=2 * steps) for steps in (100, 5000)]
+    job: Any = SimpleNamespace(trained_rollouts=3, idle_rollouts=1)
+    earlier: Any = [SimpleNamespace(evaluated_rollouts=2, found=SimpleNamespace(search_steps=np.array([4000])))]
+    each = CONFIG.steps_per_update
+    assert spent_on(verdicts, job, CONFIG, earlier) == EnvSteps(1100, 3 * each, 10_200 - 2 * each, each)

@@ -2,8 +2,9 @@
 
 import pytest
 
+from levelproof.configs.compose import compose_job
 from levelproof.configs.schema import GrowConfig
-from levelproof.pipeline.jobs.choice import MANY, MAX_THREADS, runs_here, workers_here
+from levelproof.pipeline.jobs.choice import MANY, MAX_THREADS, most_workers, runs_here, workers_here
 from levelproof.pipeline.runtime import own_cores
 from tests.pipeline.made import made_job
 
@@ -18,6 +19,21 @@ def test_job_runs_here_up_to_a_number_of_levels(words: tuple[str, ...], levels: 
     job = made_job("data", "executor=auto", *words)
     assert runs_here(job, levels)
     assert not runs_here(job, levels + 1)
+
+
+@pytest.mark.parametrize(
+    ("words", "levels", "workers"),
+    [
+        ((), 1000, 125),
+        (("workers=64",), 1000, 64),
+        (("workers=64",), 256, 32),
+        (("workers=64", "unit=32"), 256, 8),
+        (("size=l",), 16, 8),
+        (("workers=4",), 1, 1),
+    ],
+)
+def test_workers_of_ray_have_a_part_of_a_unit_each(words: tuple[str, ...], levels: int, workers: int) -> None:
+    assert most_workers(compose_job(words), levels) == workers
 
 
 def test_growing_is_judged_by_its_levels_alone() -> None:

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -20,10 +21,12 @@ from rich.console import Console
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs import cluster
 from levelproof.pipeline.jobs.address import noticing_slow_starts, require_reachable
-from levelproof.pipeline.jobs.likeness import mismatch, program_of, with_absolute_paths
+from levelproof.pipeline.jobs.likeness import mismatch, program_of, unseen, with_absolute_paths
 from levelproof.pipeline.jobs.progress import Board, Tally
 from levelproof.pipeline.jobs.schedule import MAX_UNITS, Scheduler, WorkUnit
 from levelproof.pipeline.store.layout import JOB
+from levelproof.pipeline.store.leases import served
+from levelproof.pipeline.store.locks import only_writer
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from tests.pace import patience
 from tests.pipeline.command import COMMAND_SECONDS, ROOT, assert_refused, descendants, run, start, title, until
@@ -337,6 +340,17 @@ def test_crew_starts_thousands_of_workers_in_parts(monkeypatch: pytest.MonkeyPat
     crew._handles = handles
     counts = [crew.start_workers() or sum(handle.starting for handle in handles) for _ in range(2)]
     assert 0 < counts[0] < counts[1] < len(handles) / 10
+
+
+def test_worker_that_does_not_see_the_split_is_refused(split: Path, tmp_path: Path) -> None:
+    """On another machine, the folder may be missing or another one."""
+    here = Path(shutil.copytree(split, tmp_path / "here"))
+    with only_writer(here, print):
+        ours = served(here)
+        assert ours
+        assert unseen(here, ours) == unseen(here, "") == ""
+        for elsewhere in tmp_path / "missing", Path(shutil.copytree(split, tmp_path / "other")):
+            assert f"does not see {elsewhere} as this command does: use a folder that all" in unseen(elsewhere, ours)
 
 
 def test_mismatch_names_what_differs() -> None:

@@ -24,7 +24,7 @@ from levelproof.pipeline.errors import Failure, StoreFailure, UserError
 from levelproof.pipeline.jobs import seal as jobs_seal
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import failure
-from levelproof.pipeline.store import leases, machine, publish, remote
+from levelproof.pipeline.store import leases, leftovers, machine, publish, remote
 from levelproof.pipeline.store.checksums import has_own
 from levelproof.pipeline.store.event_files import KEPT, events_of, new_run, runs_in, write_events
 from levelproof.pipeline.store.layout import (
@@ -360,6 +360,35 @@ def test_full_disk_of_temporary_files_is_named_instead_of_the_store(
     with pytest.raises(Failure, match=words):
         jobs_seal.Sealer(THERE, [], print)._seal([])
     assert re.match(words, failure(THERE, WorkUnit((0,)), OSError(errno.ENOSPC, "")).fatal)
+
+
+@pytest.mark.slow
+def test_data_committed_while_a_store_is_cleaned_is_not_called_unnamed(
+    server: Server, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An earlier writer's worker commits after the manifest was read, and removes its mark before marks are listed."""
+    told, answers, put_if = list[str](), [], publish.put_if
+
+    def put_while_cleaning(path: Path, data: bytes, there: Any) -> Any:
+        monkeypatch.setattr(publish, "put_if", put_if)
+
+        def read_then_commit(*given: Any, **more: Any) -> Any:
+            manifest = read_manifest(*given, **more)
+            answers.append(put_if(path, data, there))
+            remove([file for file in remote.stored_in(THERE) if file.suffix == ".begun"])
+            return manifest
+
+        monkeypatch.setattr(leftovers, "read_manifest", read_then_commit)
+        clean(THERE, told.append)
+        monkeypatch.setattr(leftovers, "read_manifest", read_manifest)
+        return answers[0]
+
+    monkeypatch.setattr(publish, "put_if", put_while_cleaning)
+    commit_made(THERE, WorkUnit((0, 1)))
+    assert told == []
+    drive(OUT)
+    forget()
+    require_same_content(THERE, here)
 
 
 @ALSO_MOTO
