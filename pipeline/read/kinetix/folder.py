@@ -152,6 +152,11 @@ def _invalid_levels(level: Level) -> Iterator[tuple[int, str]]:
             bad = (arrays[name] < 0) | (arrays[name] > most)
             for i in np.flatnonzero(bad.reshape(-1, bad.shape[-1]).any(0)):
                 yield int(i), f"its {name.removeprefix('level/')} has values out of range for this size"
+    one_way = level.model.collides != np.swapaxes(level.model.collides, 0, 1)
+    for i in np.flatnonzero(one_way.any((0, 1))):
+        yield int(i), "its collision matrix lets a body collide with another, but not that one with it"
+    for i in np.flatnonzero(np.asarray(level.state.contact_active).any(0)):
+        yield int(i), "it begins with contacts, which levels do not"
     for bad, kind, why in flaws(level):
         for i in np.flatnonzero(np.asarray(bad).any(0)):
             yield int(i), f"one {kind} {why}"

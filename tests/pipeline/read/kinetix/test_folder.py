@@ -14,9 +14,10 @@ from numcodecs import Blosc
 
 from levelproof.levelgen.level import SIZES
 from levelproof.pipeline.read.kinetix.folder import open_folder, read_trajectories
-from levelproof.pipeline.read.kinetix.zarr2 import FormatError
+from levelproof.pipeline.read.kinetix.zarr2 import FormatError, StoredArray
 from tests.pipeline.read.kinetix.folder import GOLDEN, OTHERS, SOLVED, to_ours, trajectories_in
 
+ONE_WAY = "its collision matrix lets a body collide with another, but not that one with it"
 MAX_MEMORY = 20e6  # bytes; a chunk of four trajectories takes 1.5 MB
 
 
@@ -44,6 +45,21 @@ def test_read_trajectories_accepts_any_chunk_shape(size: str) -> None:
         np.testing.assert_array_equal(trajectories.action, record.action[..., at])
         np.testing.assert_array_equal(trajectories.level.state.position, level.state.position[..., at])
         np.testing.assert_array_equal(trajectories.level.model.vertices, level.model.vertices[..., at])
+
+
+def test_one_way_collisions_and_contacts_at_the_start_are_named(theirs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The engine would see them, but neither content hashes nor level files would."""
+    chunk = StoredArray._chunk
+
+    def altered(array: StoredArray, i: int, j: int) -> np.ndarray:
+        values = chunk(array, i, j).copy()
+        values["env_state/collision_matrix"][1, 0, 6, 4] ^= True  # of a circle and a polygon
+        values["env_state/acc_cr_manifolds/active"][2, 0, 3] = True
+        return values
+
+    monkeypatch.setattr(StoredArray, "_chunk", altered)
+    wrong = read_trajectories(open_folder(theirs).arrays[0], 0, 3).wrong
+    assert wrong == ["", ONE_WAY, "it begins with contacts, which levels do not"]
 
 
 def changed(**entries: Any) -> Callable[[Path], None]:
