@@ -1,4 +1,4 @@
-"""Add what experts do on the sealed levels to pipeline/learn/sealed.json. See README.md here.
+"""Add what experts do on the sealed levels to pipeline/learn/sealed.json, and hash them. See README.md here.
 
 python manifests/make_sealed.py sealed
 """
@@ -7,10 +7,14 @@ import json
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
+from jaxtyping import UInt8
 
 from levelproof.configs.numbers import parse_count
+from levelproof.levelgen.identity.content import content_hashes
 from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.pipeline.learn import sealed
 from levelproof.pipeline.learn.specialists import ATTEMPTS, successes_of
 from levelproof.pipeline.store.manifest import require_manifest
@@ -38,6 +42,13 @@ def main(folder: Path) -> None:
         if known["successes"]:
             sizes[size] = known | {"successes": dict(sorted(known["successes"].items(), key=lambda x: steps_of(x[0])))}
     path.write_text(json.dumps({"sizes": sizes}, indent=1) + "\n")
+    np.save(path.with_name(sealed.HASHES), np.concatenate([digests_of(size) for size in SIZES]))
+
+
+def digests_of(size: str) -> UInt8[np.ndarray, "level 16"]:
+    """Return the content hashes of a size's sealed levels, without the version of their form."""
+    hashes = content_hashes(jax.device_get(sample_levels(np.array(sealed.SEALED, np.int32), size)))
+    return np.array([[*bytes.fromhex(each.partition(":")[2])] for each in hashes], np.uint8)
 
 
 def steps_of(budget: str) -> int:

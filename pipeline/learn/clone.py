@@ -100,7 +100,7 @@ def source_of(split: Path, config: CloneConfig, tell: Callable[[str], None]) -> 
     ids = data.manifest["level_id"].to_numpy()
     require_not_sealed(split, ids, config.where)
     hashes = data.content_hashes
-    usable = without_sealed(split, hashes, data.size, tell)
+    usable = without_sealed(split, hashes, tell)
     copies = int((~usable).sum())
     train, kept = (np.flatnonzero(usable & in_subset(hashes, part, config.validation)) for part in (TRAIN, VALIDATION))
     if not len(train) or not len(kept):

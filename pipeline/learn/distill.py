@@ -131,7 +131,7 @@ def levels_for(split: Path, config: DistillConfig, tell: Callable[[str], None]) 
     data = Dataset(split, config.where or None, (), 0.0)
     ids = data.manifest["level_id"].to_numpy()
     require_not_sealed(split, ids, config.where)
-    usable = without_sealed(split, data.content_hashes, data.size, tell)
+    usable = without_sealed(split, data.content_hashes, tell)
     require_some_usable(split, usable)
     trivial = np.array([label == Label.TRIVIAL for label in data.manifest["label"].to_pylist()])
     if not (usable & ~trivial).any():

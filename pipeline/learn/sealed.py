@@ -1,31 +1,21 @@
 """The sealed levels, which measure policies and are never trained on: their ids, contents, labels and experts."""
 
 import json
-import re
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
 from levelproof.experts.labels import Label
-from levelproof.levelgen.identity.content import DIGITS, VERSION, content_hashes
-from levelproof.levelgen.identity.keys import SAMPLER_VERSION
-from levelproof.levelgen.level import SIZES
-from levelproof.levelgen.sampling.sampler import on_cpu, sample_levels
-from levelproof.physics.types import Size
+from levelproof.levelgen.identity.content import VERSION
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.runtime import cache_folder
-from levelproof.pipeline.store.files import write
 from levelproof.pipeline.words import many
 
 SEALED = range(2_000_000_000, 2_000_002_048)  # ids of the sealed levels
-HASH = re.compile(rf"c{VERSION}:[0-9a-f]{{{DIGITS}}}")
-KNOWN = "sealed.json"  # made by manifests/make_sealed.py
+KNOWN, HASHES = "sealed.json", "sealed_hashes.npy"  # made by manifests/make_sealed.py; hashes: uint8 [level, 16]
 LETTERS = {Label.SOLVED: "s", Label.TRIVIAL: "t", Label.UNSOLVABLE: "x", Label.UNSOLVED: "u"}
 SUCCESSES = "0123456789abcdefg"  # one character per level: successes in 16 attempts
 
@@ -48,14 +38,11 @@ def known_sealed(size: str) -> KnownSealed | None:
     return KnownSealed(solved, {name: read(text) for name, text in of_size["successes"].items()})
 
 
-def sealed_hashes(size: Size) -> frozenset[str]:
-    """Return the content hashes of the sealed levels that have room in a size.
-
-    A copy of a sealed level has another id if it comes from a level file. The hashes of each size are kept in the cache
-    folder, because the first sampling compiles for seconds.
-    """
-    names = [name for name, other in SIZES.items() if all(a <= b for a, b in zip(other, size, strict=True))]
-    return frozenset(content_hash for name in names for content_hash in _kept(name))
+@cache
+def sealed_hashes() -> frozenset[str]:
+    """Return the content hashes of the sealed levels of all sizes: a copy from a file or an import has another id."""
+    digests = np.load(Path(__file__).with_name(HASHES))
+    return frozenset(f"c{VERSION}:{bytes(digest).hex()}" for digest in digests)
 
 
 def require_not_sealed(split: Path, ids: Int[np.ndarray, " level"], where: str) -> None:
@@ -68,11 +55,9 @@ def require_not_sealed(split: Path, ids: Int[np.ndarray, " level"], where: str) 
         )
 
 
-def without_sealed(
-    place: Path, hashes: Iterable[str], size: Size, tell: Callable[[str], None]
-) -> Bool[np.ndarray, " level"]:
+def without_sealed(place: Path, hashes: Iterable[str], tell: Callable[[str], None]) -> Bool[np.ndarray, " level"]:
     """Return which levels of a split or of files, by content hash, are not copies of sealed ones; report the others."""
-    sealed = sealed_hashes(size)
+    sealed = sealed_hashes()
     usable = np.array([content_hash not in sealed for content_hash in hashes])
     if copies := int((~usable).sum()):
         tell(f"Left out {many(copies, 'level')} of {place}: copies of sealed levels, kept to measure policies.")
@@ -83,18 +68,3 @@ def require_some_usable(place: Path, usable: Bool[np.ndarray, " level"]) -> None
     """Raise UserError if all levels are copies of sealed ones."""
     if not usable.any():
         raise UserError(f"{place} has only copies of sealed levels, kept to measure policies: choose others.")
-
-
-def _kept(name: str) -> list[str]:
-    folder = cache_folder() / "sealed"
-    path = folder / f"{name}-{SAMPLER_VERSION}-{VERSION}-{SEALED.start}-{len(SEALED)}.json"
-    with suppress(OSError, ValueError, TypeError):  # missing or damaged
-        known = json.loads(path.read_text())
-        if len(known) == len(SEALED) and all(map(HASH.fullmatch, known)):
-            return known
-    with on_cpu():
-        hashes = content_hashes(jax.device_get(sample_levels(np.array(SEALED, np.int32), name)))
-    with suppress(OSError):  # the next command hashes them again
-        folder.mkdir(exist_ok=True)
-        write(path, json.dumps(hashes).encode())
-    return hashes

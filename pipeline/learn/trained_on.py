@@ -51,7 +51,7 @@ def levels_for(config: TrainConfig, tell: Callable[[str], None]) -> TrainingLeve
     if split:
         require_not_sealed(place, groups[0].level_ids, config.where)
     hashes = np.array(content_hashes(groups[0].levels))
-    usable = without_sealed(place, hashes, groups[0].levels.size, tell)
+    usable = without_sealed(place, hashes, tell)
     require_some_usable(place, usable)
     parts = [take(group.levels, np.flatnonzero(usable)) for group in groups]
     _require_enough(config, sum(map(len, parts)))

@@ -33,7 +33,6 @@ from levelproof.pipeline.learn.curves import draw_curves
 from levelproof.pipeline.learn.pool import Feed, read_pool, validation_batches
 from levelproof.pipeline.learn.sealed import SEALED
 from levelproof.pipeline.learn.trained_on import levels_for
-from levelproof.pipeline.runtime import CACHE_VARIABLE
 from levelproof.pipeline.store.locks import only_trainer
 from tests.pace import patience
 from tests.pipeline.command import assert_refused, here
@@ -322,16 +321,15 @@ def test_clone_writes_nothing_to_a_recreated_folder(
     assert not list(out.iterdir())
 
 
-def test_copies_of_sealed_levels_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+def test_copies_of_sealed_levels_are_left_out(tmp_path: Path) -> None:
     copies, messages = played_split(tmp_path / "copies", copies=SEALED[-16:]), []
-    for _ in range(2):  # hashed, then from the cache folder
-        source = module.source_of(copies, CloneConfig(where="", validation=0.5), messages.append)
-        others = np.flatnonzero(source.data.manifest["level_id"].to_numpy() >= 16)
-        assert 1 < source.copies == len(source.data) - len(others)
-        assert sorted([*source.train, *source.validation]) == others.tolist()
-        assert f"Left out {source.copies} levels of" in messages.pop()
-        monkeypatch.setattr("levelproof.pipeline.learn.sealed.content_hashes", None)
+    source = module.source_of(copies, CloneConfig(where="", validation=0.5), messages.append)
+    others = np.flatnonzero(source.data.manifest["level_id"].to_numpy() >= 16)
+    assert 1 < source.copies == len(source.data) - len(others)
+    assert sorted([*source.train, *source.validation]) == others.tolist()
+    assert messages == [
+        f"Left out {source.copies} levels of {copies}: copies of sealed levels, kept to measure policies."
+    ]
     ids = source.data.manifest["level_id"].to_numpy()
     for starts in (1, 2):
         trained = levels_for(TrainConfig(levels=str(copies), where="label = 'solved'", starts=starts), print)
@@ -341,10 +339,6 @@ def test_copies_of_sealed_levels_are_left_out(tmp_path: Path, monkeypatch: pytes
         )
     distilled = distill.levels_for(copies, DistillConfig(where=""), print)
     np.testing.assert_array_equal(distilled.data.manifest["level_id"].to_numpy()[distilled.chosen], ids[others])
-    (kept,) = (tmp_path / "cache" / "sealed").iterdir()
-    kept.write_text("[]")
-    with pytest.raises(TypeError):
-        module.source_of(copies, CloneConfig(where=""), print)
 
 
 def test_guide_lists_every_setting_with_its_default_and_meaning() -> None:

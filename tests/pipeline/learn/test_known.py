@@ -2,11 +2,14 @@
 
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
+import levelproof
+from levelproof.levelgen.identity.content import content_hashes
 from levelproof.levelgen.level import SIZES
-from levelproof.pipeline.learn.sealed import SEALED, known_sealed
+from levelproof.pipeline.learn.sealed import SEALED, known_sealed, sealed_hashes
 from levelproof.pipeline.learn.specialists import sealed_specialists, successes_of
 from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.command import here
@@ -33,6 +36,16 @@ def test_known_sealed_levels_are_what_a_job_makes_of_them(size: str, tmp_path: P
     assert size == "l" or (successes != expected).sum() <= 4
     assert np.abs(successes - expected).mean() <= 0.5
     assert np.abs(successes - np.roll(expected, 1)).mean() > 2, "other levels would show"
+
+
+@pytest.mark.parametrize("size", ["s", *(pytest.param(size, marks=pytest.mark.slow) for size in ("m", "l"))])
+def test_known_hashes_are_those_of_the_sealed_levels(size: str) -> None:
+    """If this fails after a change of the sampler or of hashes, run manifests/make_sealed.py."""
+    levels = jax.device_get(levelproof.sample_levels(np.array(SEALED, np.int32), size))
+    hashes = {*content_hashes(levels)}
+    assert len(hashes) == len(SEALED)
+    assert hashes < sealed_hashes()
+    assert len(sealed_hashes()) == len(SIZES) * len(SEALED)
 
 
 def test_known_sealed_levels_fit_the_sealed_ids() -> None:

@@ -257,6 +257,7 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         levels_for(TrainConfig(levels=str(split), where=""), print)
     with pytest.raises(levelproof.UserError, match=rf"where=\"\(label = 'solved'\) AND level_id < {first}\""):
         levels_for(TrainConfig(levels=str(split), where="label = 'solved'"), print)
+    monkeypatch.setattr(sealed, "sealed_hashes", lambda: frozenset(data.content_hashes))
     with pytest.raises(levelproof.UserError, match="only copies of sealed levels"):
         levels_for(TrainConfig(levels=str(tmp_path)), print)  # their content, whatever their ids
 
