@@ -147,7 +147,7 @@ def in_a_row(values: ArrayLike, what: str, count: int | None = None) -> Int[np.n
         UserError: they are no integers, have several axes, or are not `count`.
     """
     given = whole_numbers(values, what)
-    if given.ndim > 1 or (given.ndim and count is not None and len(given) != count):
+    if given.ndim > 1 or (given.ndim and count is not None and len(given) not in (1, count)):
         wanted = "one axis" if count is None else f"the shape [{count}], as the indices"
         raise UserError(f"The {what} have the shape {[*given.shape]}: they must have {wanted}.")
     return np.broadcast_to(given, count) if count is not None else np.atleast_1d(given)

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,7 @@ from levelproof.pipeline.store.seed.rows import reason_of
 from levelproof.pipeline.store.seed.source import LevelSource
 from levelproof.pipeline.store.seed.worlds import pack_worlds
 from levelproof.pipeline.store.seed.write import seed_bytes
-from levelproof.pipeline.store.shard import refuse_unlike
+from levelproof.pipeline.store.shard import Unlike
 from levelproof.pipeline.words import many
 
 READ = (
@@ -142,7 +142,7 @@ def _witnesses(manifest: Manifest, rows: pa.Table) -> tuple[list[bytes], np.ndar
     """
     known = [field.name for field in table_for(size_of(rows["size"][0].as_py()))]
     wanted = [name for name in known if name.startswith(("level/", STATE)) or name in (LAST_DISTANCE, *MOVES)]
-    arrays = read_rows(manifest.split, rows, wanted, refuse_unlike)
+    arrays = read_rows(manifest.split, rows, wanted, _refuse)
     steps, lanes = rows.column("steps_to_goal").fill_null(0).to_numpy(), np.arange(rows.num_rows)
     done, goal, action = (arrays[name] for name in ("record/done", "record/goal", "record/action"))
     wrong = (steps < 1) | (done.argmax(0) != steps - 1) | ~goal[steps - 1, lanes]
@@ -154,6 +154,15 @@ def _witnesses(manifest: Manifest, rows: pa.Table) -> tuple[list[bytes], np.ndar
     live = np.asarray(action_mask(tree_of(Level, arrays, "level/")))
     packed = [pack_witness(action[: steps[i], :, i], live[:, i]) for i in lanes]
     return packed, checksum_of(task_states(arrays, STATE, timesteps(done)), steps)
+
+
+def _refuse(unlike: Sequence[Unlike]) -> None:
+    """Raise Failure, because checksums of states that this machine computes would not be those of the stored ones."""
+    ids = ", ".join(str(level_id) for one in unlike for level_id in one.level_ids)
+    raise Failure(
+        f"{unlike[0]}, so their checksums would not be those of the stored states: export them on the machine that "
+        f'made them, or leave them out with --where "level_id NOT IN ({ids})".'
+    )
 
 
 def _content(manifest: Manifest, rows: pa.Table) -> Iterator[bytes | None]:

@@ -157,12 +157,23 @@ def _require_same_folder(folder: Folder, parts: list[UnitOfRows], split: Path) -
                 f"{split} was imported from another folder (it has {file} instead of {wanted}): one folder makes one "
                 "split, so name a new split with -o."
             )
-    last = {part.unit.level_ids[-1] for part in parts}
-    if changed := [fragment for fragment in manifest.fragments if ids_of(fragment.path)[1] not in last]:
-        raise UserError(
-            f"{folder.path} has other trajectories than when {split} was imported (its unit {changed[0].path.stem} "
-            "ends within one of now): import it elsewhere, with -o."
-        )
+    for last in (ids_of(fragment.path)[1] for fragment in manifest.fragments):
+        part = next((part for part in parts if last in part.unit.level_ids[:-1]), None)
+        if part and _is_usable(part, last + 1):
+            raise UserError(
+                f"{folder.path} has other trajectories than when {split} was imported (that of level {last} was the "
+                "last of its unit): import it elsewhere, with -o."
+            )
+
+
+def _is_usable(part: UnitOfRows, level_id: int) -> bool:
+    """Whether a record from this id on can be imported: a sealed fragment is named after its last row, not unit."""
+    first = part.first + level_id - part.unit.level_ids[0]
+    try:
+        wrong = read_trajectories(part.array, first, part.first + len(part.unit.level_ids)).wrong
+    except FormatError as error:
+        raise Failure(f"Cannot read {part.array.path}: {error}.") from None
+    return not all(wrong)
 
 
 def _import(

@@ -2,6 +2,7 @@
 
 import hashlib
 import socket
+import time
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -13,6 +14,7 @@ from levelproof.pipeline.store.remote import absolute, as_typed, is_remote
 
 Program = dict[str, str]  # versions by name
 COMPARED = ("levelproof", "jax", "jaxlib", "sampler")  # names in `provenance.versions`
+UNSEEN = 60  # s until a machine that does not see the split is left out
 FOLDERS = ("physics", "levelgen", "experts", "configs", "pipeline")
 
 
@@ -36,12 +38,26 @@ def mismatch(program: Program, job: JobConfig) -> str:
 
 def unseen(split: Path, writer: str) -> str:
     """Return a sentence if this machine does not see the folder in which the driver is the writer; empty: it does."""
-    if not writer or is_remote(split) or is_written_by(split, writer):
+    if not writer or is_remote(split):
+        return ""
+    until = time.monotonic() + UNSEEN
+    while not _sees(split, writer):  # a network's file system may remember for a while that there was no such folder
+        if time.monotonic() > until:
+            break
+        time.sleep(0.5)
+    else:
         return ""
     return (
         f"The worker on {socket.gethostname()} does not see {split} as this command does: use a folder that all "
         "machines share, or the URL of an object store, as out."
     )
+
+
+def _sees(split: Path, writer: str) -> bool:
+    try:
+        return is_written_by(split, writer)
+    except OSError:  # permissions, or a file in place of a folder
+        return False
 
 
 def with_absolute_paths(job: JobConfig) -> JobConfig:

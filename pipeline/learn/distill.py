@@ -163,10 +163,11 @@ def levels_for(split: Path, config: DistillConfig, tell: Callable[[str], None]) 
 
 
 def weights_of(experts: KnownExperts) -> str:
-    """Return a digest of experts' weights, and of whose they are."""
-    digest = hashlib.sha256(experts.expert.tobytes())
+    """Return a digest of experts' weights, and of which levels have one."""
+    has_one = experts.expert >= 0
+    digest = hashlib.sha256(has_one.tobytes())
     for leaf in jax.tree.leaves(experts.params):
-        digest.update(np.ascontiguousarray(leaf).data)
+        digest.update(np.ascontiguousarray(leaf[experts.expert[has_one]]).data)  # in the order of the levels
     return digest.hexdigest()[:16]
 
 

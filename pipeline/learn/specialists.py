@@ -8,15 +8,17 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from jaxtyping import Int
 
+from levelproof.configs.schema import from_files
 from levelproof.experts.labels import Label
 from levelproof.levelgen.batching import take
-from levelproof.levelgen.identity.content import content_hashes
+from levelproof.levelgen.identity.signature import signatures
 from levelproof.levelgen.level import name_of
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.learn.measured import MeasuredLevels
 from levelproof.pipeline.learn.sealed import known_sealed
 from levelproof.pipeline.learn.solve_rates import Solved
 from levelproof.pipeline.store.manifest import require_manifest
+from levelproof.pipeline.store.seed.file import is_seed
 
 ATTEMPTS = 16  # attempts per expert in splits whose configuration does not say
 COMPARED = 64  # levels whose content is compared with that of the split's
@@ -55,7 +57,8 @@ def specialists_of(split: Path, levels: MeasuredLevels, attempts: int) -> Specia
             f"{split} lacks {len(missing):,} of the levels, such as {missing[0]}: label them there first, or name "
             "another split with --experts."
         )
-    _require_same_levels(split, levels)
+    if not (is_seed(split) and from_files(config)):  # which may be without levels; ids follow from the levels there
+        _require_same_levels(split, levels)
     rows = table.take([row_of[level_id] for level_id in level_ids.tolist()])
     rates = table.filter(pc.field("label") == Label.SOLVED)["success_rate"]
     if len(rates) and rates.null_count == len(rates):
@@ -70,14 +73,12 @@ def specialists_of(split: Path, levels: MeasuredLevels, attempts: int) -> Specia
 
 def _require_same_levels(split: Path, levels: MeasuredLevels) -> None:
     """Raise UserError if a split has other levels of these ids: of another distribution, or imported ones."""
-    if levels.start:
-        return  # states within witnesses, whose hashes differ
     ids = levels.level_ids[:COMPARED]
-    rows = require_manifest(split, ["level_id", "content_hash"], ids).table.sort_by("level_id")
-    hash_of = dict(zip(rows["level_id"].to_pylist(), rows["content_hash"].to_pylist(), strict=True))
-    ours = content_hashes(take(levels.levels, np.arange(len(ids))))
-    others = [i for i, ours_of_it in zip(ids.tolist(), ours, strict=True) if hash_of[i] != ours_of_it]
-    if 2 * len(others) > len(ids):  # few may differ by rounding, where a GPU sampled them
+    rows = require_manifest(split, ["level_id", "signature"], ids).table.sort_by("level_id")
+    theirs = dict(zip(rows["level_id"].to_pylist(), rows["signature"].to_pylist(), strict=True))
+    ours = signatures(take(levels.levels, np.arange(len(ids))))  # equal in a half, if only rounding differs
+    others = [i for i, ours_of_it in zip(ids.tolist(), ours, strict=True) if not {*theirs[i]} & {*ours_of_it}]
+    if others:
         raise UserError(
             f"{split} has other levels with the ids of {levels.name}, such as {others[0]}: name a split of the same "
             "levels with --experts."

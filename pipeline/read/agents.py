@@ -3,7 +3,7 @@
 import runpy
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -81,7 +81,8 @@ class Neighbours:
         try:
             yield
         finally:
-            sys.path.remove(str(self._folder))
+            with suppress(ValueError):  # the agent may have changed the list
+                sys.path.remove(str(self._folder))
             for name in sys.modules.keys() - before:
                 beside = self._folder / (top := name.partition(".")[0])
                 if top not in known and (beside.with_suffix(".py").is_file() or (beside / "__init__.py").is_file()):

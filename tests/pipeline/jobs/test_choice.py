@@ -24,11 +24,11 @@ def test_job_runs_here_up_to_a_number_of_levels(words: tuple[str, ...], levels: 
 @pytest.mark.parametrize(
     ("words", "levels", "workers"),
     [
-        ((), 1000, 125),
-        (("workers=64",), 1000, 64),
-        (("workers=64",), 256, 32),
+        ((), 1000, 63),
+        (("workers=48",), 1000, 48),
+        (("workers=64",), 256, 16),
         (("workers=64", "unit=32"), 256, 8),
-        (("size=l",), 16, 8),
+        (("size=l",), 16, 4),
         (("workers=4",), 1, 1),
     ],
 )

@@ -19,7 +19,7 @@ from ray._private import ray_constants
 from rich.console import Console
 
 from levelproof.pipeline.errors import Failure, UserError
-from levelproof.pipeline.jobs import cluster
+from levelproof.pipeline.jobs import cluster, likeness
 from levelproof.pipeline.jobs.address import noticing_slow_starts, require_reachable
 from levelproof.pipeline.jobs.likeness import mismatch, program_of, unseen, with_absolute_paths
 from levelproof.pipeline.jobs.progress import Board, Tally
@@ -342,8 +342,11 @@ def test_crew_starts_thousands_of_workers_in_parts(monkeypatch: pytest.MonkeyPat
     assert 0 < counts[0] < counts[1] < len(handles) / 10
 
 
-def test_worker_that_does_not_see_the_split_is_refused(split: Path, tmp_path: Path) -> None:
+def test_worker_that_does_not_see_the_split_is_refused(
+    split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """On another machine, the folder may be missing or another one."""
+    monkeypatch.setattr(likeness, "UNSEEN", 0)
     here = Path(shutil.copytree(split, tmp_path / "here"))
     with only_writer(here, print):
         ours = served(here)

@@ -14,6 +14,8 @@ from levelproof.levelgen.files.level_file import read_level_file
 from levelproof.levelgen.identity.content import content_hashes
 from levelproof.pipeline.jobs import imported as module
 from levelproof.pipeline.look.status import read_status
+from levelproof.pipeline.read.kinetix.folder import Trajectories
+from levelproof.pipeline.read.kinetix.zarr2 import StoredArray
 from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.store import seal
 from levelproof.pipeline.store.manifest import read_manifest
@@ -192,6 +194,30 @@ def test_import_of_a_folder_that_has_grown_is_refused(
     (fewer / "second/.zarray").write_text(json.dumps(about))
     done = here(["import", "theirs", "-o", "data/1M/s"], tmp_path)
     assert_refused(done, 2, "theirs has other trajectories than when data/1M/s was imported", "import it elsewhere")
+    assert here(["seal", "data/1M/s"], tmp_path).returncode == 0
+    assert_refused(here(["import", "theirs", "-o", "data/1M/s"], tmp_path), 2, "has other trajectories than when")
+
+
+def test_sealed_import_whose_last_record_was_left_out_is_complete(
+    once: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sealed fragment is named after its last row, so its unit seems to have grown."""
+    read = module.read_trajectories
+
+    def without_last(array: StoredArray, first: int, last: int) -> Trajectories:
+        found = read(array, first, last)
+        if array.path.name == "second" and last == array.rows:
+            found.wrong[-1] = "it is impossible"
+        return found
+
+    monkeypatch.setattr(module, "read_trajectories", without_last)
+    words = ["import", str(once / "theirs"), "-o", "data/1M/s"]
+    for _ in range(2):
+        done = here(words, tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert f"{ROWS - 1} levels of" in done.stdout
+        assert here(["seal", "data/1M/s"], tmp_path).returncode == 0
+    assert [fragment.sealed for fragment in read_manifest(tmp_path / "data/1M/s").fragments] == [True]
 
 
 def test_a_row_that_an_array_lacks_is_no_level(once: Path, tmp_path: Path) -> None:
