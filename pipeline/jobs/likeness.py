@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 
 from levelproof.configs.schema import JobConfig
-from levelproof.pipeline.store.leases import is_written_by
+from levelproof.pipeline.store.leases import has_writer
 from levelproof.pipeline.store.provenance import versions
 from levelproof.pipeline.store.remote import absolute, as_typed, is_remote
 
@@ -37,25 +37,28 @@ def mismatch(program: Program, job: JobConfig) -> str:
 
 
 def unseen(split: Path, writer: str) -> str:
-    """Return a sentence if this machine does not see the folder in which the driver is the writer; empty: it does."""
+    """Return a sentence if this machine does not see the folder to which the driver writes; empty: it does.
+
+    A folder to which another command writes has been taken over: commits say so.
+    """
     if not writer or is_remote(split):
         return ""
     until = time.monotonic() + UNSEEN
-    while not _sees(split, writer):  # a network's file system may remember for a while that there was no such folder
+    while not _sees(split):  # a network's file system may remember for a while that there was no such folder
         if time.monotonic() > until:
             break
         time.sleep(0.5)
     else:
         return ""
     return (
-        f"The worker on {socket.gethostname()} does not see {split} as this command does: use a folder that all "
-        "machines share, or the URL of an object store, as out."
+        f"The worker on {socket.gethostname()} does not see {split}: use a folder that all machines share, or the URL of "
+        "an object store, as out."
     )
 
 
-def _sees(split: Path, writer: str) -> bool:
+def _sees(split: Path) -> bool:
     try:
-        return is_written_by(split, writer)
+        return has_writer(split)
     except OSError:  # permissions, or a file in place of a folder
         return False
 
