@@ -51,8 +51,8 @@ def unseen(split: Path, writer: str) -> str:
     else:
         return ""
     return (
-        f"The worker on {socket.gethostname()} does not see {split}: use a folder that all machines share, or the URL of "
-        "an object store, as out."
+        f"The worker on {socket.gethostname()} does not see {split}: use a folder that all machines share, or the URL "
+        "of an object store, as out."
     )
 
 
