@@ -110,6 +110,48 @@ def test_grid_draws_visible_levels(page: Any, address: str) -> None:
     assert page.evaluate(UNNAMED) == []
 
 
+MILLIONS = """(count) => {
+    const layout = levelproof.Grid.prototype.layout;
+    levelproof.Grid.prototype.layout = function () {
+        window.grid = this;
+        layout.call(this);
+    };
+    dispatchEvent(new Event("scroll"));
+    return new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => {
+        grid.show(Uint32Array.from({ length: count }, (_, i) => i % grid.rows.length), "steps_to_goal");
+        done(grid.element.clientHeight);
+    })));
+}"""
+SHOWN = """() => [...document.querySelectorAll(".cell")].filter((cell) => {
+    const { top, bottom } = cell.getBoundingClientRect();
+    return cell.checkVisibility() && bottom > 0 && top < innerHeight;
+}).map((cell) => Number(cell.ariaPosInSet)).sort((a, b) => a - b)"""
+
+
+def test_grid_of_millions_of_levels_is_no_higher_than_browsers_show(page: Any, address: str) -> None:
+    """Every level can be reached by scrolling or by keys, and cells lie side by side."""
+    count = 3_000_000
+    page.goto(address)
+    wait_until_drawn(page)
+    assert page.evaluate(MILLIONS, count) <= 8_000_000
+    for share in (0, 0.25, 0.5, 1):
+        page.evaluate("share => scrollTo(0, share * (document.body.scrollHeight - innerHeight))", share)
+        page.wait_for_timeout(100)
+        shown = page.evaluate(SHOWN)
+        assert shown == [*range(shown[0], shown[0] + len(shown))]
+        assert len(shown) >= 12
+        assert abs(shown[0] / count - share) < 0.001
+    assert shown[-1] == count
+    page.locator(f"[aria-posinset='{count}'] a").focus()
+    for key, position in ("ArrowLeft", count - 1), ("Home", 1), ("ArrowRight", 2), ("End", count):
+        page.keyboard.press(key)
+        assert page.evaluate("document.activeElement.closest('.cell').ariaPosInSet") == str(position)
+        assert position in page.evaluate(SHOWN)
+    page.keyboard.press("PageUp")
+    page.keyboard.press("ArrowUp")
+    assert int(page.evaluate("document.activeElement.closest('.cell').ariaPosInSet")) in page.evaluate(SHOWN)
+
+
 def test_address_keeps_filters_and_order(page: Any, address: str, split: Path) -> None:
     page.goto(address)
     wait_until_drawn(page)

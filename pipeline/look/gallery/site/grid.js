@@ -8,6 +8,7 @@
   const BEYOND = 1; // rows drawn ahead, above and below the screen
   const BUDGET = 6; // ms; time to draw per frame
   const LOADS = 6; // maximum number of blocks loading at a time
+  const HIGHEST = 8e6; // px; browsers cut taller elements off, Firefox at 17.9 million
 
   class Grid {
     constructor(element, columns, worlds, hrefOf) {
@@ -19,6 +20,7 @@
       this.queue = []; // cells to draw
       this.loading = 0;
       this.detail = "steps_to_goal"; // the column that captions show
+      [this.pace, this.shift] = [1, 0]; // pixels of the grid per pixel of scrolling; how much lower cells are for that
       this.colours = levelproof.coloursOf();
       this.asked = false;
       const later = () => this.later();
@@ -66,8 +68,16 @@
         this.cells.clear();
       }
       Object.assign(this, { across, wide, tall });
-      this.element.style.height = this.rows.length ? `${Math.ceil(this.rows.length / across) * tall}px` : "";
-      const above = -this.element.getBoundingClientRect().top;
+      const whole = Math.ceil(this.rows.length / across) * tall;
+      const height = Math.min(whole, HIGHEST);
+      this.element.style.height = this.rows.length ? `${height}px` : "";
+      // In a grid that would be too high, one pixel of scrolling passes several of the grid
+      this.pace = whole > height ? (whole - innerHeight) / (height - innerHeight) : 1;
+      this.most = Math.max(0, height - innerHeight); // px; beyond, one pixel passes one
+      const [top, before] = [-this.element.getBoundingClientRect().top, this.shift];
+      this.shift = Math.min(Math.max(0, top), this.most) * (1 - this.pace);
+      const above = top - this.shift;
+      if (this.shift !== before) for (const [index, cell] of this.cells) this.place(cell, index);
       const first = Math.max(0, (Math.floor(above / tall) - BEYOND) * across);
       const last = Math.min(this.rows.length, (Math.ceil((above + innerHeight) / tall) + BEYOND) * across);
       for (const [index, cell] of this.cells) {
@@ -113,7 +123,7 @@
       cell.element.hidden = false;
       cell.element.style.width = `${this.wide}px`;
       cell.element.style.height = `${this.tall}px`;
-      cell.element.style.transform = `translate(${(index % this.across) * this.wide}px, ${Math.floor(index / this.across) * this.tall}px)`;
+      this.place(cell, index);
       cell.element.setAttribute("aria-posinset", index + 1);
       cell.element.setAttribute("aria-setsize", this.rows.length);
       cell.link.href = this.hrefOf(row);
@@ -132,6 +142,11 @@
       }
       this.want(cell);
       return cell;
+    }
+
+    place(cell, index) {
+      const [x, y] = [(index % this.across) * this.wide, Math.floor(index / this.across) * this.tall + this.shift];
+      cell.element.style.transform = `translate(${x}px, ${y}px)`;
     }
 
     want(cell) {
@@ -177,9 +192,12 @@
       if (before) before.link.tabIndex = -1;
       this.current = Math.min(this.rows.length - 1, Math.max(0, index));
       if (focuses) {
-        const top = Math.floor(this.current / this.across) * this.tall + this.element.getBoundingClientRect().top;
-        if (top < 0) scrollBy(0, top - 8);
-        else if (top + this.tall > innerHeight) scrollBy(0, top + this.tall - innerHeight + 8);
+        const scrolled = -this.element.getBoundingClientRect().top;
+        const above = scrolled - this.shift;
+        const top = Math.floor(this.current / this.across) * this.tall - above;
+        const wanted = above + (top < 0 ? top - 8 : Math.max(0, top + this.tall - innerHeight + 8));
+        const within = Math.min(Math.max(0, wanted), this.most * this.pace);
+        scrollBy(0, wanted - within + within / this.pace - scrolled);
         this.layout();
       }
       const cell = this.cells.get(this.current);
