@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from levelproof.configs.numbers import parse_count
 from levelproof.levelgen.identity.content import content_hashes
 from levelproof.levelgen.level import SIZES
-from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.sampling.sampler import on_cpu, sample_levels
 from levelproof.pipeline.learn import sealed
 from levelproof.pipeline.learn.specialists import ATTEMPTS, successes_of
 from levelproof.pipeline.store.manifest import require_manifest
@@ -47,7 +47,8 @@ def main(folder: Path) -> None:
 
 def digests_of(size: str) -> UInt8[np.ndarray, "level 16"]:
     """Return the content hashes of a size's sealed levels, without the version of their form."""
-    hashes = content_hashes(jax.device_get(sample_levels(np.array(sealed.SEALED, np.int32), size)))
+    with on_cpu():
+        hashes = content_hashes(jax.device_get(sample_levels(np.array(sealed.SEALED, np.int32), size)))
     return np.array([[*bytes.fromhex(each.partition(":")[2])] for each in hashes], np.uint8)
 
 

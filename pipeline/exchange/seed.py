@@ -38,9 +38,10 @@ from levelproof.pipeline.store.seed.rows import reason_of
 from levelproof.pipeline.store.seed.source import LevelSource
 from levelproof.pipeline.store.seed.worlds import pack_worlds
 from levelproof.pipeline.store.seed.write import seed_bytes
-from levelproof.pipeline.store.shard import Unlike
+from levelproof.pipeline.store.shard import Report, Unlike
 from levelproof.pipeline.words import many
 
+NAMED = 100  # levels that a message lists at most
 READ = (
     "content_hash", "label_reason", "witness", "size", "budget", "shard", "row", "versions", "engine", "device", *KEPT,
 )  # fmt: skip
@@ -74,8 +75,10 @@ def export_seed(split: Path, where: str | None, out: Path, with_levels: bool = T
     with writing_to(out):
         with ProgressBar("levels", rows.num_rows, Console(stderr=True)) as bar:
             parts = (rows.slice(first, ROW_GROUP) for first in range(0, rows.num_rows, ROW_GROUP))
-            groups = (_group(manifest, part, with_levels, bar) for part in parts)
+            differing = list[Unlike]()
+            groups = (_group(manifest, part, with_levels, bar, differing.extend) for part in parts)
             data = seed_bytes(groups, config, rows["budget"][0].as_py())
+        _require_alike(differing, where)
         files.write(out, data)
     solved = manifest.counts(np.isin(manifest.level_ids, rows["level_id"].to_numpy())).get(Label.SOLVED, 0)
     each = f", {len(data) / solved:.1f} bytes per solved one" if solved else ""
@@ -109,15 +112,17 @@ def _without_folder(rows: pa.Table, split: Path) -> pa.Table:
     return rows.set_column(rows.schema.get_field_index("file"), "file", [pa.array(below, pa.string())])
 
 
-def _group(manifest: Manifest, rows: pa.Table, with_levels: bool, bar: ProgressBar) -> tuple[pa.Table, list[str]]:
-    """Return a row group, and the content hashes of its levels; `bar` counts its rows."""
+def _group(
+    manifest: Manifest, rows: pa.Table, with_levels: bool, bar: ProgressBar, report: Report
+) -> tuple[pa.Table, list[str]]:
+    """Return a row group, and the content hashes of its levels; `bar` counts its rows, `report` is of `read_rows`."""
     columns: dict[str, Any] = {name: rows.column(name) for name in ("level_id", *KEPT)}
     columns |= {"source": rows.column("witness"), "label_reason": _reasons(rows), "made_with": _made_with(rows)}
     witnessed = np.flatnonzero(rows.column("shard").is_valid())
     witness, checksum = np.full(rows.num_rows, None, object), np.zeros(rows.num_rows, np.uint32)
     for first in range(0, len(witnessed), CHUNK):
         some = witnessed[first : first + CHUNK]
-        witness[some], checksum[some] = _witnesses(manifest, rows.take(some))
+        witness[some], checksum[some] = _witnesses(manifest, rows.take(some), report)
         bar.advance(len(some))
     columns["witness"] = pa.array(witness.tolist(), pa.binary())
     columns["checksum"] = pa.array(checksum, mask=~rows.column("shard").is_valid().to_numpy())
@@ -133,16 +138,15 @@ def _plain(column: Any) -> Any:
     return column.cast(pa.string()) if pa.types.is_dictionary(column.type) else column
 
 
-def _witnesses(manifest: Manifest, rows: pa.Table) -> tuple[list[bytes], np.ndarray]:
+def _witnesses(manifest: Manifest, rows: pa.Table, report: Report) -> tuple[list[bytes], np.ndarray]:
     """Pack the first episodes of rows; return them and their checksums.
 
     Raises:
-        Failure: an episode is not as the manifest says, or this machine computes other states than the one that made
-            them, of which the checksum must be.
+        Failure: an episode is not as the manifest says.
     """
     known = [field.name for field in table_for(size_of(rows["size"][0].as_py()))]
     wanted = [name for name in known if name.startswith(("level/", STATE)) or name in (LAST_DISTANCE, *MOVES)]
-    arrays = read_rows(manifest.split, rows, wanted, _refuse)
+    arrays = read_rows(manifest.split, rows, wanted, report)
     steps, lanes = rows.column("steps_to_goal").fill_null(0).to_numpy(), np.arange(rows.num_rows)
     done, goal, action = (arrays[name] for name in ("record/done", "record/goal", "record/action"))
     wrong = (steps < 1) | (done.argmax(0) != steps - 1) | ~goal[steps - 1, lanes]
@@ -156,12 +160,18 @@ def _witnesses(manifest: Manifest, rows: pa.Table) -> tuple[list[bytes], np.ndar
     return packed, checksum_of(task_states(arrays, STATE, timesteps(done)), steps)
 
 
-def _refuse(unlike: Sequence[Unlike]) -> None:
-    """Raise Failure, because checksums of states that this machine computes would not be those of the stored ones."""
-    ids = ", ".join(str(level_id) for one in unlike for level_id in one.level_ids)
+def _require_alike(differing: Sequence[Unlike], where: str | None) -> None:
+    """Raise Failure if checksums would be of states that this machine computes, which differ from the stored ones."""
+    ids = [level_id for one in differing for level_id in one.level_ids]
+    if not ids:
+        return
+    remedy = "export them on the machine that made them"
+    if len(ids) <= NAMED:
+        condition = f"level_id NOT IN ({', '.join(map(str, ids))})"
+        remedy += f', or leave them out with --where "{f"({where}) AND " if where else ""}{condition}"'
     raise Failure(
-        f"{unlike[0]}, so their checksums would not be those of the stored states: export them on the machine that "
-        f'made them, or leave them out with --where "level_id NOT IN ({ids})".'
+        f"On this machine the engine computes states that differ from the stored ones for {many(len(ids), 'level')}, "
+        f"such as {ids[0]}, so checksums would not be those of the stored states: {remedy}."
     )
 
 

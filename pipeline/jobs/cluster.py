@@ -39,7 +39,7 @@ from levelproof.pipeline.jobs.progress import STOPPING, Board, Meters
 from levelproof.pipeline.jobs.schedule import Round, Scheduler, Settle, UnitOutcome, levels_text, until_report
 from levelproof.pipeline.runtime import NO_GPU, jax_sees_a_gpu, own_cores
 from levelproof.pipeline.stopping import Stop
-from levelproof.pipeline.store.leases import served
+from levelproof.pipeline.store.leases import require_served, served
 from levelproof.pipeline.store.remote import absolute
 from levelproof.pipeline.words import duration
 
@@ -286,8 +286,10 @@ class Crew:
         """Exclude a machine, because it has another program or does not see the split.
 
         Raises:
+            LeaseLost: it is not seen anywhere, because another command has taken it over.
             Failure: no other worker is left.
         """
+        require_served(self._split)
         handle.end()
         self._refused.add(handle.node)
         for other in [other for other in self._handles if other.node == handle.node]:

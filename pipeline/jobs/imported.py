@@ -159,7 +159,7 @@ def _require_same_folder(folder: Folder, parts: list[UnitOfRows], split: Path) -
             )
     for last in (ids_of(fragment.path)[1] for fragment in manifest.fragments):
         part = next((part for part in parts if last in part.unit.level_ids[:-1]), None)
-        if part and _is_usable(part, last + 1):
+        if last > parts[-1].unit.level_ids[-1] or (part and _is_usable(part, last + 1)):
             raise UserError(
                 f"{folder.path} has other trajectories than when {split} was imported (that of level {last} was the "
                 "last of its unit): import it elsewhere, with -o."

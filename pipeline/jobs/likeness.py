@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 
 from levelproof.configs.schema import JobConfig
-from levelproof.pipeline.store.leases import has_writer
+from levelproof.pipeline.store.leases import is_written_by
 from levelproof.pipeline.store.provenance import versions
 from levelproof.pipeline.store.remote import absolute, as_typed, is_remote
 
@@ -37,14 +37,11 @@ def mismatch(program: Program, job: JobConfig) -> str:
 
 
 def unseen(split: Path, writer: str) -> str:
-    """Return a sentence if this machine does not see the folder to which the driver writes; empty: it does.
-
-    A folder to which another command writes has been taken over: commits say so.
-    """
+    """Return a sentence if this machine does not see the folder in which the driver is the writer; empty: it does."""
     if not writer or is_remote(split):
         return ""
     until = time.monotonic() + UNSEEN
-    while not _sees(split):  # a network's file system may remember for a while that there was no such folder
+    while not _sees(split, writer):  # a network's file system may remember for a while that there was no such folder
         if time.monotonic() > until:
             break
         time.sleep(0.5)
@@ -56,9 +53,9 @@ def unseen(split: Path, writer: str) -> str:
     )
 
 
-def _sees(split: Path) -> bool:
+def _sees(split: Path, writer: str) -> bool:
     try:
-        return has_writer(split)
+        return is_written_by(split, writer)
     except OSError:  # permissions, or a file in place of a folder
         return False
 

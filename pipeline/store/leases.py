@@ -225,9 +225,9 @@ def _taken(path: Path, text: bytes, say: Callable[[str], None]) -> Version:
         time.sleep(POLL)
 
 
-def has_writer(split: Path) -> bool:
-    """Whether this machine sees a current or last writer of a split."""
-    return bool(_writer(split))
+def is_written_by(split: Path, writer: str) -> bool:
+    """Whether this machine sees that a split's current or last writer has this token."""
+    return _writer(split) == writer
 
 
 def _writer(split: Path) -> str:

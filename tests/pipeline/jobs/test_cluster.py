@@ -345,17 +345,18 @@ def test_crew_starts_thousands_of_workers_in_parts(monkeypatch: pytest.MonkeyPat
 def test_worker_that_does_not_see_the_split_is_refused(
     split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On another machine, the folder may be missing or another one. (One that was taken over is found at a commit.)"""
+    """On another machine, the folder may be missing or another one, such as of an earlier run there."""
     monkeypatch.setattr(likeness, "UNSEEN", 0)
     here = Path(shutil.copytree(split, tmp_path / "here"))
     with only_writer(here, print):
         ours = served(here)
         assert ours
         assert unseen(here, ours) == unseen(here, "") == ""
-        assert unseen(here, "another") == ""
-        (tmp_path / "other").mkdir()
         (tmp_path / "file").touch()
-        for elsewhere in tmp_path / "missing", tmp_path / "other", tmp_path / "file":
+        earlier = Path(shutil.copytree(split, tmp_path / "earlier"))
+        with only_writer(earlier, print):
+            pass
+        for elsewhere in tmp_path / "missing", tmp_path / "file", earlier:
             assert f"does not see {elsewhere}: use a folder that all machines share" in unseen(elsewhere, ours)
 
 

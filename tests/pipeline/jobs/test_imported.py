@@ -183,7 +183,7 @@ def test_import_continues_after_a_stop(
     assert [[row[name] for name in same] for row in got] == [[row[name] for name in same] for row in want]
 
 
-def test_import_of_a_folder_that_has_grown_is_refused(
+def test_import_of_a_folder_that_has_grown_or_shrunk_is_refused(
     once: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Rows were added to its last array since: the unit that ends with it would count as done."""
@@ -195,6 +195,8 @@ def test_import_of_a_folder_that_has_grown_is_refused(
     done = here(["import", "theirs", "-o", "data/1M/s"], tmp_path)
     assert_refused(done, 2, "theirs has other trajectories than when data/1M/s was imported", "import it elsewhere")
     assert here(["seal", "data/1M/s"], tmp_path).returncode == 0
+    assert_refused(here(["import", "theirs", "-o", "data/1M/s"], tmp_path), 2, "has other trajectories than when")
+    (fewer / "second/.zarray").write_text(json.dumps(about | {"shape": [1, 256]}))
     assert_refused(here(["import", "theirs", "-o", "data/1M/s"], tmp_path), 2, "has other trajectories than when")
 
 

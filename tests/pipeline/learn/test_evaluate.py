@@ -75,7 +75,7 @@ def test_experts_of_a_split_stand_beside_the_baselines(split: Path, tmp_path: Pa
     pair = chosen(np.arange(2))
     with pytest.raises(UserError, match=r"lacks 1 of the levels, such as 2000000000:"):
         specialists_of(split, pair._replace(level_ids=np.array([ids[0], 2_000_000_000])), 1)
-    with pytest.raises(UserError, match=rf"has other levels with the ids of .*, such as {ids[1]}: name a split"):
+    with pytest.raises(UserError, match=rf"has other levels with the ids of .*, such as {ids[0]}: name a split"):
         specialists_of(split, pair._replace(level_ids=ids[[1, 0]]), 1)
     labelled = ROOT / "manifests" / "16k" / "m"
     with pytest.raises(UserError, match="16k/m has no success rates, because procedure=label"):
@@ -84,6 +84,10 @@ def test_experts_of_a_split_stand_beside_the_baselines(split: Path, tmp_path: Pa
     drifted = pair.levels.state.position + np.float32(1e-6)  # as another version of the sampler may round
     rounded = pair._replace(levels=replace(pair.levels, state=replace(pair.levels.state, position=drifted)))
     assert specialists_of(split, rounded, 1)
+    model = group.levels.model
+    stronger = group._replace(levels=replace(group.levels, model=replace(model, motor_power=model.motor_power * 2)))
+    with pytest.raises(UserError, match="has other levels with the ids of"):  # of another distribution
+        specialists_of(split, stronger, 1)
     done = here(["evaluate", "--on", str(split), "--experts", str(labelled), *ONCE], tmp_path)
     assert_refused(done, 2, "16k/m are not of size s: name another split with --experts")
     words = "--on", str(split), "--experts", str(split), str(split), "--levels", "4", *ONCE

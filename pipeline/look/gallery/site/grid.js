@@ -20,7 +20,8 @@
       this.queue = []; // cells to draw
       this.loading = 0;
       this.detail = "steps_to_goal"; // the column that captions show
-      [this.pace, this.shift] = [1, 0]; // pixels of the grid per pixel of scrolling; how much lower cells are for that
+      // Pixels of the grid per pixel of scrolling, up to how many of these, and how much lower cells are for that
+      [this.pace, this.most, this.shift] = [1, 0, 0];
       this.colours = levelproof.coloursOf();
       this.asked = false;
       const later = () => this.later();
@@ -69,11 +70,15 @@
       }
       Object.assign(this, { across, wide, tall });
       const whole = Math.ceil(this.rows.length / across) * tall;
-      const height = Math.min(whole, HIGHEST);
-      this.element.style.height = this.rows.length ? `${height}px` : "";
+      this.element.style.height = whole ? `${Math.min(whole, HIGHEST)}px` : "";
+      const height = whole ? this.element.getBoundingClientRect().height : 0; // less than that in a browser that zooms
       // In a grid that would be too high, one pixel of scrolling passes several of the grid
-      this.pace = whole > height ? (whole - innerHeight) / (height - innerHeight) : 1;
-      this.most = Math.max(0, height - innerHeight); // px; beyond, one pixel passes one
+      const pace = whole > height + 1 ? (whole - innerHeight) / (height - innerHeight) : 1;
+      if (pace !== this.pace) {
+        const above = -this.element.getBoundingClientRect().top - this.shift;
+        [this.pace, this.most] = [pace, Math.max(0, height - innerHeight)]; // px; beyond, one pixel passes one
+        this.scroll(above);
+      }
       const [top, before] = [-this.element.getBoundingClientRect().top, this.shift];
       this.shift = Math.min(Math.max(0, top), this.most) * (1 - this.pace);
       const above = top - this.shift;
@@ -91,6 +96,12 @@
         if (!this.cells.has(index)) this.cells.set(index, this.fill(this.free.pop() || this.cell(), index));
       }
       this.draw();
+    }
+
+    // Scroll until so many pixels of the grid are above the screen.
+    scroll(above) {
+      const within = Math.min(Math.max(0, above), this.most * this.pace);
+      scrollBy(0, above - within + within / this.pace + this.element.getBoundingClientRect().top);
     }
 
     cell() {
@@ -192,12 +203,11 @@
       if (before) before.link.tabIndex = -1;
       this.current = Math.min(this.rows.length - 1, Math.max(0, index));
       if (focuses) {
-        const scrolled = -this.element.getBoundingClientRect().top;
-        const above = scrolled - this.shift;
+        this.layout(); // the page may have scrolled since
+        const above = -this.element.getBoundingClientRect().top - this.shift;
         const top = Math.floor(this.current / this.across) * this.tall - above;
-        const wanted = above + (top < 0 ? top - 8 : Math.max(0, top + this.tall - innerHeight + 8));
-        const within = Math.min(Math.max(0, wanted), this.most * this.pace);
-        scrollBy(0, wanted - within + within / this.pace - scrolled);
+        const by = top < 0 ? top - 8 : Math.max(0, top + this.tall - innerHeight + 8);
+        if (by) this.scroll(above + by);
         this.layout();
       }
       const cell = this.cells.get(this.current);
