@@ -522,7 +522,7 @@ def test_verify_finds_missing_levels_after_a_kill_in_a_store_whose_clock_is_ahea
     with on_a_day("Fri, 01 Jan 2038 00:00:00 GMT", tmp_path / "s3") as patched:
         put(THERE / WRITER_LOCK, left_by_a_killed_writer(within="another machine"))
         patched.setattr(leases, "WATCH", patience(0.3))
-        patched.setattr(verify, "prepare_jax", lambda: None)  # JAX keeps the cache folder of these tests
+        patched.setattr(verify, "prepare_jax", lambda **_: None)  # JAX keeps the cache folder of these tests
         done = command(["verify", str(THERE), "--json"], tmp_path)
     assert done.returncode == 1, done.stdout
     facts = json.loads(done.stdout)
