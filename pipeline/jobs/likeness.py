@@ -43,14 +43,12 @@ def unseen(split: Path, writer: str) -> str:
     until = time.monotonic() + UNSEEN
     while not _sees(split, writer):  # a network's file system may remember for a while that there was no such folder
         if time.monotonic() > until:
-            break
+            return (
+                f"The worker on {socket.gethostname()} does not see this command's {split}: use a folder that all "
+                "machines share, or the URL of an object store, as out."
+            )
         time.sleep(0.5)
-    else:
-        return ""
-    return (
-        f"The worker on {socket.gethostname()} does not see {split}: use a folder that all machines share, or the URL "
-        "of an object store, as out."
-    )
+    return ""
 
 
 def _sees(split: Path, writer: str) -> bool:

@@ -357,7 +357,9 @@ def test_worker_that_does_not_see_the_split_is_refused(
         with only_writer(earlier, print):
             pass
         for elsewhere in tmp_path / "missing", tmp_path / "file", earlier:
-            assert f"does not see {elsewhere}: use a folder that all machines share" in unseen(elsewhere, ours)
+            assert f"does not see this command's {elsewhere}: use a folder that all machines share" in unseen(
+                elsewhere, ours
+            )
 
 
 def test_mismatch_names_what_differs() -> None:
