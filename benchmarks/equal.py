@@ -206,17 +206,17 @@ def measured(args: argparse.Namespace, way: str, seed: int) -> dict[str, Any]:
     look_at = lambda spent: folder.with_name(f"{folder.name}-after-{spent}-{args.measured}.json")
     if before >= ends[-1]:
         raise UserError(f"{way}: what comes before training takes {before:,.0f} core-seconds: raise --core-seconds.")
-    for spent in (end for end in ends if end > before):
+    limits = {end: (end - before) / scale for end in ends if end > before}  # in seconds of this processor
+    so_far = sum(line[SECONDS] for line in lines_of(folder)[-1:])  # 0: not yet begun
+    if so_far > LATE * limits[ends[-1]]:
+        raise UserError(f"{folder} has a run of more than {ends[-1]:,.0f} core-seconds: choose another --folder.")
+    for spent, limit in limits.items():
         look, is_last = look_at(f"{spent:g}"), spent == ends[-1]
-        limit = (spent - before) / scale  # in seconds of this processor
-        so_far = lines_of(folder)[-1:]
-        is_late = bool(so_far) and so_far[0][SECONDS] > LATE * limit
-        if is_last and is_late:
-            raise UserError(f"{folder} has a run of more than {spent:,.0f} core-seconds: choose another --folder.")
-        if not is_last and (is_late or look.exists()):
+        if not is_last and (look.exists() or so_far > LATE * limit):
             continue  # a run that was stopped, or had fewer core-seconds, came that far
         curve = trained(args, folder, way, start, seed, limit)
-        if not is_last and curve[-1][SECONDS] > LATE * limit:
+        so_far = curve[-1][SECONDS]
+        if not is_last and so_far > LATE * limit:
             continue  # the first command takes longer
         rates = kept(args.folder / f"{folder.name}-{curve[-1][STEPS]}-{args.measured}.json", folder, *measuring(args))
         solved = rates[SOLVED][SAMPLED]["once"]

@@ -17,7 +17,7 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
 
 
 def too_few(successes: int, trials: int, share: float) -> bool:
-    """Whether successes are fewer than chance leaves (exact one-sided p < 0.001) if each trial succeeds at `share`."""
+    """Whether chance does not explain so few successes (exact one-sided p < 0.001) if `share` of all trials succeed."""
     return bool(binomtest(successes, trials, share, alternative="less").pvalue < 1e-3)
 
 

@@ -76,3 +76,9 @@ def split_lanes(tree: T, lanes: int) -> T:
 def merge_lanes(tree: T) -> T:
     """Join arrays [part, ..., lane] to [..., lane], the inverse of `split_lanes`."""
     return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], x.shape[0] * x.shape[-1]), tree)
+
+
+def merge_steps(tree: T) -> T:
+    """Join arrays [step, ..., lane] to [..., lane], each old lane's steps side by side; numpy arrays stay numpy's."""
+    last = lambda x: x.transpose(*range(1, x.ndim), 0)
+    return jax.tree.map(lambda x: last(x).reshape(*x.shape[1:-1], x.shape[0] * x.shape[-1]), tree)

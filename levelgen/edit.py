@@ -236,8 +236,8 @@ def _edited(level: Level, change: Callable[[Level], None]) -> Level:
     one = one_of(level)
     change(one)
     after: Level = jax.tree.map(lambda x: np.asarray(x)[..., None], one)
-    before = one_of(level)
-    placed = (one.state.position != before.state.position).any(-1) | ~before.model.active  # moved or added
+    position, active = (np.asarray(x)[..., 0] for x in (level.state.position, level.model.active))
+    placed = (one.state.position != position).any(-1) | ~active  # moved or added
     placed &= one.model.active & (np.arange(len(placed)) >= FIXED_POLYGONS)
     far = np.abs(one.state.position[placed]).max(initial=0) > 2 * WORLD_SIDE
     if far or not np.isfinite(after.state.position).all():

@@ -82,7 +82,7 @@ def step_ours(level: Level, action: Int[np.ndarray, "6 lane"], params: Params = 
 
 
 def env_step_ours(level: Level, action: Int[np.ndarray, "6 lane"]) -> tuple[State, Int[np.ndarray, " lane"]]:
-    """Take one env step in every lane, without reset; return states, and how each episode ends: goal 1, red -1, ..."""
+    """Take one env step in every lane, without reset; return states and ends: 1 goal, -1 red, GOES_ON, BROKEN_DOWN."""
     return jax.device_get(_env_step(level, action))
 
 

@@ -227,7 +227,9 @@ def _steps(level: Level, states: State, action: np.ndarray, end: int) -> tuple[f
 
     worst = int(np.argmax(apart))
     differs = [k for k in np.flatnonzero(ends != their_ends).tolist() if k <= last]
-    reasons = [explained(k, lambda _, ended, k=k: their_ends[k] in ended) for k in differs]
+    answers = [explained(k, lambda _, ended, k=k: their_ends[k] in ended) for k in differs]
     if apart[worst] > OFF:
-        reasons.append(explained(worst, lambda state, _: reached(state, lanes_of(theirs, [worst]))))
-    return float(apart[worst]), NOT_EXPLAINED if not all(reasons) else STEP_AMPLIFIES if reasons else STEPS_AGREE
+        answers.append(explained(worst, lambda state, _: reached(state, lanes_of(theirs, [worst]))))
+    if not all(answers):
+        return float(apart[worst]), NOT_EXPLAINED
+    return float(apart[worst]), STEP_AMPLIFIES if answers else STEPS_AGREE

@@ -174,7 +174,7 @@ def kernel_of(size: Size, dist: Distribution) -> Kernel:
 
 
 def on_cpu() -> AbstractContextManager[Any]:
-    """Let this thread compute on the CPU if JAX has one: levels have the same bits on any, but not on a GPU."""
+    """Let this thread compute on the CPU if JAX has one: levels have the same bits on every CPU, but not on a GPU."""
     if jax.default_backend() == "cpu":
         return nullcontext()  # another setting of JAX would make other stored programs
     try:

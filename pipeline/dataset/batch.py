@@ -144,7 +144,7 @@ def in_a_row(values: ArrayLike, what: str, count: int | None = None) -> Int[np.n
     """Convert integers [item] to int64; a scalar counts as `count` of them, by default one.
 
     Raises:
-        UserError: they are no integers, have several axes, or are not `count`.
+        UserError: they are not integers, have several axes, or are neither one nor `count`.
     """
     given = whole_numbers(values, what)
     if given.ndim > 1 or (given.ndim and count is not None and len(given) not in (1, count)):

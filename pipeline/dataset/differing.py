@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from levelproof.pipeline.errors import Failure, UserError
-from levelproof.pipeline.store.shard import EngineDiffers, Unlike
+from levelproof.pipeline.store.shard import STATES_DIFFER, EngineDiffers, Unlike
 from levelproof.pipeline.words import many
 
 KEEP, LEAVE_OUT, RAISE = "keep", "leave_out", "raise"
@@ -46,10 +46,8 @@ class Differing:
             is_first, self._reported = not self._reported, True
         if self._way != RAISE and not is_first:
             return
-        found = (
-            "On this machine the engine computes states that differ from the stored ones for "
-            f"{many(len(self.level_ids), 'level')} of {self._split} so far, such as level {ids[0]}"
-        )
+        count = many(len(self.level_ids), "level")
+        found = f"{STATES_DIFFER} {count} of {self._split} so far, such as level {ids[0]}"
         if self._way == RAISE:
             raise Failure(f"{found}: {WAYS[RAISE]}.")
         try:

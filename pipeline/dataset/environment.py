@@ -14,8 +14,7 @@ from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 from levelproof.physics.types import Size
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.read.levels import COLUMNS, levels_of, rules_of
-from levelproof.pipeline.read.select import columns_in, select
-from levelproof.pipeline.store.manifest import require_manifest
+from levelproof.pipeline.read.select import require_selected
 
 
 def make(
@@ -85,9 +84,7 @@ def _of_split(
     resets: tuple[bool, bool],
 ) -> tuple[Environment, EnvParams]:
     """Make an environment of the levels of a split, with the task's rules there if `rules` are None."""
-    # Two steps, because hashes and contents of seeds take time: they are made of the selected levels only
-    chosen = select(require_manifest(Path(split), ["level_id", *columns_in(where)]).table, where)["level_id"]
-    manifest = require_manifest(Path(split), ["level_id", *COLUMNS], chosen.to_numpy())
+    manifest = require_selected(Path(split), ["level_id", *COLUMNS], where)
     rows = manifest.table
     if not rows.num_rows:
         raise UserError(

@@ -21,7 +21,7 @@ from levelproof.levelgen.task.actions import action_mask
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.read.levels import levels_of, writing_to
 from levelproof.pipeline.read.rows import read_rows
-from levelproof.pipeline.read.select import columns_in, select_some
+from levelproof.pipeline.read.select import both, columns_in, select_some
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store import files
 from levelproof.pipeline.store.contents import table_for
@@ -38,7 +38,7 @@ from levelproof.pipeline.store.seed.rows import reason_of
 from levelproof.pipeline.store.seed.source import LevelSource
 from levelproof.pipeline.store.seed.worlds import pack_worlds
 from levelproof.pipeline.store.seed.write import seed_bytes
-from levelproof.pipeline.store.shard import Report, Unlike
+from levelproof.pipeline.store.shard import STATES_DIFFER, Report, Unlike
 from levelproof.pipeline.words import many
 
 NAMED = 100  # levels that a message lists at most
@@ -167,11 +167,11 @@ def _require_alike(differing: Sequence[Unlike], where: str | None) -> None:
         return
     remedy = "export them on the machine that made them"
     if len(ids) <= NAMED:
-        condition = f"level_id NOT IN ({', '.join(map(str, ids))})"
-        remedy += f', or leave them out with --where "{f"({where}) AND " if where else ""}{condition}"'
+        others = both(where, f"level_id NOT IN ({', '.join(map(str, ids))})")
+        remedy += f', or leave them out with --where "{others}"'
     raise Failure(
-        f"On this machine the engine computes states that differ from the stored ones for {many(len(ids), 'level')}, "
-        f"such as {ids[0]}, so checksums would not be those of the stored states: {remedy}."
+        f"{STATES_DIFFER} {many(len(ids), 'level')}, such as {ids[0]}, so checksums would not be those of the stored "
+        f"states: {remedy}."
     )
 
 

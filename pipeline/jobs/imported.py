@@ -1,6 +1,7 @@
 """The job of `levelproof import`: replay another program's trajectories here, and store them as a split."""
 
 import shlex
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
@@ -148,7 +149,8 @@ def _parts(folder: Folder) -> Iterator[UnitOfRows]:
 
 def _require_same_folder(folder: Folder, parts: list[UnitOfRows], split: Path) -> None:
     """Raise UserError if the split has trajectories of another folder, or of this one before it changed."""
-    manifest = read_manifest(split, ["level_id", "file"], [part.unit.level_ids[0] for part in parts])
+    starts = [part.unit.level_ids[0] for part in parts]
+    manifest = read_manifest(split, ["level_id", "file"], starts)
     files = {row["level_id"]: row["file"] for row in manifest.table.to_pylist()}
     for part in parts:
         wanted = _file(folder, part.array, part.first)
@@ -158,8 +160,9 @@ def _require_same_folder(folder: Folder, parts: list[UnitOfRows], split: Path) -
                 "split, so name a new split with -o."
             )
     for last in (ids_of(fragment.path)[1] for fragment in manifest.fragments):
-        part = next((part for part in parts if last in part.unit.level_ids[:-1]), None)
-        if last > parts[-1].unit.level_ids[-1] or (part and _is_usable(part, last + 1)):
+        part = parts[bisect_right(starts, last) - 1]
+        beyond = last - part.unit.level_ids[-1]
+        if beyond > 0 or (beyond < 0 and _is_usable(part, last + 1)):
             raise UserError(
                 f"{folder.path} has other trajectories than when {split} was imported (that of level {last} was the "
                 "last of its unit): import it elsewhere, with -o."

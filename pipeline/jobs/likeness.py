@@ -1,4 +1,6 @@
-"""Checking that a worker runs the driver's program, as its levels must equal any other's, and sees its split."""
+"""What a worker checks before it begins: that it runs the driver's program, so that its levels equal those of any
+other worker, and that it sees the driver's split.
+"""
 
 import hashlib
 import socket

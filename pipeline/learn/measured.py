@@ -21,7 +21,7 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.learn.sealed import SEALED, known_sealed
 from levelproof.pipeline.read.level_files import levels_at, levels_below
 from levelproof.pipeline.read.levels import COLUMNS, levels_of, rules_of
-from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.read.select import require_selected
 from levelproof.pipeline.store.job_note import sound_note
 from levelproof.pipeline.store.manifest import fragment_paths, refuse_folder_of_splits, require_manifest
 from levelproof.pipeline.store.remote import as_typed, is_remote
@@ -105,8 +105,7 @@ def levels_in(
 
 
 def _of_split(split: Path, where: str | None, count: int | None) -> MeasuredLevels:
-    chosen = select(require_manifest(split, columns_in(where)).table, where)["level_id"].to_numpy()[:count]
-    manifest = require_manifest(split, COLUMNS, chosen)
+    manifest = require_selected(split, COLUMNS, where, count)
     rows = manifest.table
     if not rows.num_rows:
         raise UserError(

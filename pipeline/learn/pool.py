@@ -145,25 +145,32 @@ class Feed:
         """Yield the batches of all updates from number `first` on, which draws from `pools`."""
         config, over = self._config, Event()
 
-        def ahead_of(turn: int) -> Future[list[LevelPool]] | None:
-            """Start to read the pools of the next turn; None: no update needs them."""
-            needed = self._changes and (turn + 1) * config.refresh < config.train.updates
-            return reader.submit(self._read, turn + 1, lambda _: _require(not over.is_set())) if needed else None
+        def follow(_: int) -> None:
+            """End the reading ahead, which is told of each read, once its pool will not be needed."""
+            if over.is_set():
+                raise CancelledError
 
         with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as drawer:
             turn = self._turn(first)
-            coming = ahead_of(turn)
+            coming = self._ahead(reader, turn, follow)
             ahead = drawer.submit(self._draw, pools, first)
             try:
                 for update in range(first, config.train.updates):
                     now = ahead.result()
                     if (after := self._turn(update + 1)) != turn and coming and update + 1 < config.train.updates:
                         turn, pools = after, coming.result()
-                        coming = ahead_of(turn)
+                        coming = self._ahead(reader, turn, follow)
                     ahead = drawer.submit(self._draw, pools, update + 1)
                     yield now
             finally:
-                over.set()  # a pool that is being read will not be needed
+                over.set()
+
+    def _ahead(
+        self, reader: ThreadPoolExecutor, turn: int, follow: Callable[[int], None]
+    ) -> Future[list[LevelPool]] | None:
+        """Start to read the pools of the next turn; None: no update needs them."""
+        needed = self._changes and (turn + 1) * self._config.refresh < self._config.train.updates
+        return reader.submit(self._read, turn + 1, follow) if needed else None
 
     @property
     def _changes(self) -> bool:
@@ -185,11 +192,6 @@ class Feed:
         rng = np.random.default_rng([self._config.seed, update])
         pool = pools[rng.choice(len(pools), p=self._weights)]
         return pool.draw(rng, rng.integers(0, len(pool.steps), self._config.train.batch))
-
-
-def _require(goes_on: bool) -> None:
-    if not goes_on:
-        raise CancelledError
 
 
 def validation_batches(source: PartedSplit, config: CloneConfig) -> list[Transitions]:

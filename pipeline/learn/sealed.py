@@ -12,6 +12,7 @@ from jaxtyping import Bool, Int
 from levelproof.experts.labels import Label
 from levelproof.levelgen.identity.content import VERSION
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.read.select import both
 from levelproof.pipeline.words import many
 
 SEALED = range(2_000_000_000, 2_000_002_048)  # ids of the sealed levels
@@ -48,10 +49,9 @@ def sealed_hashes() -> frozenset[str]:
 def require_not_sealed(split: Path, ids: Int[np.ndarray, " level"], where: str) -> None:
     """Raise UserError if a split has sealed ids among these, which the condition `where` selects."""
     if sealed := int(((ids >= SEALED.start) & (ids < SEALED.stop)).sum()):
-        condition = f"({where}) AND level_id < {SEALED.start}" if where else f"level_id < {SEALED.start}"
         raise UserError(
             f"{split} has {many(sealed, 'level')} with ids from {SEALED.start} to {SEALED.stop - 1}, which are sealed "
-            f'to measure policies: exclude them, as in where="{condition}".'
+            f'to measure policies: exclude them, as in where="{both(where, f"level_id < {SEALED.start}")}".'
         )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from levelproof.configs.train import TrainConfig
+from levelproof.experts.generalist.config import CHUNK
 from levelproof.experts.generalist.curricula import UNIFORM, Curriculum
 from levelproof.experts.generalist.evolve import evolve
 from levelproof.experts.generalist.learnability import learnability
@@ -76,8 +77,8 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
         tell(f"Trains {config.start} on {source.name}.")
     recipe = recipe_of(config, source, start, cores)
     if (share := config.ppo.samples(cores) * cores / config.ppo.environments) < config.ppo.subsample:
-        of_cores = f"{many(cores, 'core')} of {many(config.ppo.environments // cores, 'lane')}"
-        tell(f"Learns from {share:.1%} of the samples instead of {config.ppo.subsample:.1%}: on {of_cores}.")
+        why = f"each of {many(cores, 'core')} learns from a whole number of chunks of {CHUNK} lanes"
+        tell(f"Learns from {share:.1%} of the samples instead of {config.ppo.subsample:.1%}, because {why}.")
     note = note_of(config, source, cores)
     params = None if start is None else start.params
     with writing_run(out) as require_ours:

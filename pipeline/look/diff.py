@@ -5,6 +5,7 @@ Reads the manifests only, no shards. The splits may differ in budget or procedur
 
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,6 @@ def compare(one: Path, other: Path, where: str | None = None, rows: int = 10) ->
     totals = [sum(steps.values()) if steps else 0 for steps in spent]
     costs = [cost.cost_of(side) for side in (left, right)]
     seconds = [sum(side["seconds"].values()) if side else 0.0 for side in costs]
-    alike = all(costs) and len({(side["of"], side["levels"]) for side in costs if side}) == 1
     counts = [[int(mask.sum()) for mask in (side & tried, tried)] for side in solved]
     return {
         "splits": [as_typed(one), as_typed(other)],
@@ -79,7 +79,7 @@ def compare(one: Path, other: Path, where: str | None = None, rows: int = 10) ->
         "env_steps": spent,
         "env_steps_for_one_more": (totals[1] - totals[0]) / gained if gained and all(spent) else None,
         "cost": costs,
-        "seconds_for_one_more": (seconds[1] - seconds[0]) / gained if gained and alike else None,
+        "seconds_for_one_more": (seconds[1] - seconds[0]) / gained if gained and _comparable(costs) else None,
         "steps_to_goal": _paired(left, right, solved[0] & solved[1]),
     }
 
@@ -127,6 +127,11 @@ def _spent(rows: pa.Table, manifest: Manifest) -> dict[str, int] | None:
     return {name: int(rows[name].to_numpy().sum()) for name in SPENT}
 
 
+def _comparable(costs: Sequence[dict[str, Any] | None]) -> bool:
+    """Whether both splits know the cost of as many levels, in seconds of the same kind of device."""
+    return all(costs) and len({(side["of"], side["levels"]) for side in costs if side}) == 1
+
+
 def _label_changes(left: pa.Table, right: pa.Table) -> dict[str, dict[str, int]]:
     """Count levels by their label in `left`, then by their label in `right`."""
     codes = [np.array([LABELS.index(word) for word in side["label"].to_pylist()]) for side in (left, right)]
@@ -171,7 +176,7 @@ def _print(facts: dict[str, Any], console: Console) -> None:
         here, there = (side[name] for side in facts["env_steps"])
         if here or there:
             table.add_row(name.replace("_", " "), f"{here:,}", f"{there:,}", f"{there - here:+,}")
-    if all(facts["cost"]) and len({(cost["of"], cost["levels"]) for cost in facts["cost"]}) == 1:
+    if _comparable(facts["cost"]):
         here, there = (sum(side["seconds"].values()) for side in facts["cost"])
         table.add_row(f"{facts['cost'][0]['of']}-seconds", f"{here:,.0f}", f"{there:,.0f}", f"{there - here:+,.0f}")
     if steps := facts["steps_to_goal"]:

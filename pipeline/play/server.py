@@ -142,10 +142,8 @@ class PageConnection:
 def _file(connection: ServerConnection, request: Request) -> Response | None:
     """Answer a request for a file; None continues with the websocket. Refuses other hosts and origins."""
     port = connection.socket.getsockname()[1]
-    names = HOST, "localhost"
-    hosts = {f"{name}:{port}" for name in names} | (
-        {*names} if port == HTTP_PORT else set()
-    )  # browsers omit the default
+    ports = [f":{port}", *[""] * (port == HTTP_PORT)]  # browsers omit the default one
+    hosts = {f"{name}{number}" for name in (HOST, "localhost") for number in ports}
     if request.headers.get("Host") not in hosts:
         return connection.respond(HTTPStatus.FORBIDDEN, "This server serves only this machine.\n")
     if request.path == SOCKET:

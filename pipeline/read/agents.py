@@ -2,7 +2,7 @@
 
 import runpy
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
@@ -73,9 +73,8 @@ class Neighbours:
 
     @contextmanager
     def within_reach(self) -> Iterator[None]:
-        """Let code import them, as `python FILE` does; afterwards nothing else finds them."""
+        """Let code import these modules, as `python FILE` does; afterwards no other code finds them."""
         before = set(sys.modules)
-        known = {name.partition(".")[0] for name in before}
         sys.path.insert(0, str(self._folder))
         sys.modules.update(self._imported)
         try:
@@ -84,9 +83,14 @@ class Neighbours:
             with suppress(ValueError):  # the agent may have changed the list
                 sys.path.remove(str(self._folder))
             for name in sys.modules.keys() - before:
-                beside = self._folder / (top := name.partition(".")[0])
-                if top not in known and (beside.with_suffix(".py").is_file() or (beside / "__init__.py").is_file()):
+                if name in self._imported or self._has(name, before):
                     self._imported[name] = sys.modules.pop(name)
+
+    def _has(self, name: str, before: Collection[str]) -> bool:
+        """Whether a module that was imported after those of `before` is one of the folder's, or within one."""
+        beside = self._folder / (top := name.partition(".")[0])
+        is_here = beside.with_suffix(".py").is_file() or (beside / "__init__.py").is_file()
+        return is_here and top not in {other.partition(".")[0] for other in before}
 
 
 def agent_in(file: Path) -> Agent:

@@ -1,6 +1,7 @@
 """Selection of manifest rows by an SQL condition, evaluated by DuckDB."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import duckdb
@@ -9,7 +10,7 @@ import pyarrow as pa
 
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.store.columns import COLUMNS, with_current_names
-from levelproof.pipeline.store.manifest import require_manifest
+from levelproof.pipeline.store.manifest import Manifest, require_manifest
 
 SOLVED = "label = 'solved'"  # default condition of exports
 EXPORT_COLUMNS = ("level_id", "size", "budget", "shard", "row")
@@ -54,6 +55,25 @@ def ids_by(table: pa.Table, clause: str, what: str, advice: str) -> np.ndarray:
         except duckdb.Error as error:
             reason = str(error).strip().splitlines()[0]
             raise UserError(f"Cannot {what} ({reason}): {advice}.") from None
+
+
+def require_selected(split: Path, columns: Sequence[str], where: str | None, count: int | None = None) -> Manifest:
+    """Read these columns of the levels that meet the condition (None: all), of the first `count` (None: all).
+
+    The columns of the condition are read first, because hashes and contents of seeds take time: none is made for a
+    level that is not selected.
+
+    Raises:
+        UserError: there is no such split, or the condition is invalid.
+        Failure: a fragment is damaged.
+    """
+    chosen = select(require_manifest(split, ["level_id", *columns_in(where)]).table, where)["level_id"].to_numpy()
+    return require_manifest(split, columns, chosen[:count])
+
+
+def both(where: str | None, condition: str) -> str:
+    """Return the condition that both `where`, which may be empty, and `condition` hold."""
+    return f"({where}) AND {condition}" if where else condition
 
 
 def select_some(split: Path, table: pa.Table, where: str | None) -> pa.Table:

@@ -165,7 +165,7 @@ def served(split: Path) -> str:
 def require_served(split: Path) -> None:
     """Raise LeaseLost if this process works for a writer that no longer has the split."""
     served = _served.get(split)
-    if served is not None and _writer(split) != served:
+    if served is not None and not is_written_by(split, served):
         raise LeaseLost(split)
 
 

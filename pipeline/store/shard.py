@@ -193,6 +193,9 @@ class Shard:
 Part = tuple[Shard, Sequence[int]]  # rows of a shard
 
 
+STATES_DIFFER = "On this machine the engine computes states that differ from the stored ones for"
+
+
 class Unlike(NamedTuple):
     """Levels of one shard whose states differ on this machine from the stored ones; one or more."""
 
@@ -203,8 +206,8 @@ class Unlike(NamedTuple):
 
     def __str__(self) -> str:
         return (
-            f"On this machine the engine computes states that differ from the stored ones for {len(self.steps)} of "
-            f"{self.read} levels of the shard {self.shard}, for level {self.level_ids[0]} from step {self.steps[0]} on"
+            f"{STATES_DIFFER} {len(self.steps)} of {self.read} levels of the shard {self.shard}, for level "
+            f"{self.level_ids[0]} from step {self.steps[0]} on"
         )
 
 

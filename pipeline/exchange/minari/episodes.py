@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Num
 
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.witness.witness import Record
-from levelproof.levelgen.batching import blocks, take
+from levelproof.levelgen.batching import blocks, merge_steps, take
 from levelproof.levelgen.level import MOTOR_BINDINGS, Level
 from levelproof.levelgen.task.actions import CHOICES, action_mask
 from levelproof.levelgen.task.observe.flat import symbolic_flat
@@ -105,10 +105,9 @@ def encode_actions(action: Int[np.ndarray, "step 6"], kind: ActionKind) -> Num[n
 @partial(jax.jit, static_argnames="rules")
 def _observe(level: Level, record: Record, rules: TaskParams) -> tuple[Array, Array]:
     """Observe before and after each step, [level, step, feature]; every step is a lane."""
-    lanes = lambda x: jnp.moveaxis(x, 0, -1).reshape(*x.shape[1:-1], x.shape[0] * x.shape[-1])
     repeated = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x), RECORD_STEPS, axis=-1), level)
-    state, timestep, last_distance, action = jax.tree.map(
-        lanes, (record.state, record.timestep, record.last_distance, record.action)
+    state, timestep, last_distance, action = merge_steps(
+        (record.state, record.timestep, record.last_distance, record.action)
     )
     after, _ = advance(repeated, TaskState(state, timestep, last_distance), action, rules)
     split = lambda features: jnp.moveaxis(features.reshape(len(features), -1, RECORD_STEPS), 0, -1)

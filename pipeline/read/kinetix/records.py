@@ -12,6 +12,7 @@ import numpy as np
 
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.witness.witness import Record
+from levelproof.levelgen.batching import merge_steps
 from levelproof.levelgen.files.kinetix import (
     BODIES,
     MANIFOLD,
@@ -62,7 +63,8 @@ def fields_of(level: Level, record: Record) -> Fields:
         record: one record per level; time first, level last.
     """
     size, count = level.size, record.done.shape[-1]
-    moving = to_kinetix(size, _lanes(record.state), STATE) | to_kinetix(size, _lanes(record.manifold), MANIFOLD)
+    state, manifold = (merge_steps(jax.tree.map(np.asarray, tree)) for tree in (record.state, record.manifold))
+    moving = to_kinetix(size, state, STATE) | to_kinetix(size, manifold, MANIFOLD)
     moving = {
         f"{WORLD}{name}": values.reshape(count, RECORD_STEPS, *values.shape[1:]) for name, values in moving.items()
     }
@@ -96,9 +98,3 @@ def dtype_of(size: Size) -> np.dtype:
     """Return the dtype of one step of a trajectory."""
     fields = fields_of(*none_of(size))
     return np.dtype([(name, fields[name].dtype, (1, *fields[name].shape[2:])) for name in sorted(fields)])
-
-
-def _lanes(tree: T) -> T:
-    """Merge the axes level and time into one lane axis, level-major."""
-    merge = lambda x: np.moveaxis(np.asarray(x), 0, -1).reshape(*x.shape[1:-1], x.shape[0] * x.shape[-1])
-    return jax.tree.map(merge, tree)

@@ -20,8 +20,9 @@
       this.queue = []; // cells to draw
       this.loading = 0;
       this.detail = "steps_to_goal"; // the column that captions show
-      // Pixels of the grid per pixel of scrolling, up to how many of these, and how much lower cells are for that
-      [this.pace, this.most, this.shift] = [1, 0, 0];
+      this.pace = 1; // pixels of the grid that a pixel of scrolling passes
+      this.most = 0; // pixels of scrolling that pass so many; beyond, a pixel passes one
+      this.shift = 0; // px; how much farther down that puts the cells
       this.colours = levelproof.coloursOf();
       this.asked = false;
       const later = () => this.later();
@@ -71,12 +72,11 @@
       Object.assign(this, { across, wide, tall });
       const whole = Math.ceil(this.rows.length / across) * tall;
       this.element.style.height = whole ? `${Math.min(whole, HIGHEST)}px` : "";
-      const height = whole ? this.element.getBoundingClientRect().height : 0; // less than that in a browser that zooms
-      // In a grid that would be too high, one pixel of scrolling passes several of the grid
+      const height = whole ? this.element.getBoundingClientRect().height : 0; // in a zoomed browser, it may be less
       const pace = whole > height + 1 ? (whole - innerHeight) / (height - innerHeight) : 1;
       if (pace !== this.pace) {
         const above = -this.element.getBoundingClientRect().top - this.shift;
-        [this.pace, this.most] = [pace, Math.max(0, height - innerHeight)]; // px; beyond, one pixel passes one
+        [this.pace, this.most] = [pace, Math.max(0, height - innerHeight)];
         this.scroll(above);
       }
       const [top, before] = [-this.element.getBoundingClientRect().top, this.shift];
