@@ -34,6 +34,7 @@ POINTS = 100  # of its curve
 PACE = 84_500.0  # env steps of s a core-second of training from scratch where the first runs were made (AMD EPYC)
 PACED = 15  # updates that measure a processor's pace
 LOOKS = 0.25, 0.5, 1.0  # shares of the core-seconds after which a policy is measured
+HOUR = 3600.0  # core-seconds of the first page; one of more hours has a page of its own
 LATE = 1.05  # of the time planned for training until then: how late that may be
 FIRST = 50_000  # id of the first level to clone from; the measured ones are sealed
 BETWEEN_SEEDS = 10_000_000  # ids
@@ -86,7 +87,7 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of all training")
     parser.add_argument("--measured", type=int, default=2048, help="sealed levels to measure on (default: 2048)")
     parser.add_argument("--folder", type=Path, default=Path("equal"), help="where everything is kept")
-    parser.add_argument("--core-seconds", type=float, default=3600.0, help="of each policy (default: 3600)")
+    parser.add_argument("--core-seconds", type=float, default=HOUR, help=f"of each policy (default: {HOUR:g})")
     parser.add_argument("--levels", default="8k", help="levels to search for a clone (default: 8k)")
     parser.add_argument("--updates", type=int, default=1500, help="updates of a clone (default: 1500)")
     parser.add_argument("--cloning", nargs="*", default=[], metavar="NAME=VALUE", help="further settings of a clone")
@@ -111,10 +112,12 @@ def run(args: argparse.Namespace) -> Report:
     rows = [list(row) for row in dict.fromkeys(tuple(row) for each in results for row in rows_of(each))]
     rows += [row_of(name, ("", "", "", "", ""), players, name) for name in PLAYERS if name in players[ALL]]
     shown = {each["way"] for each in results}
-    page = "equal" if args.size == "s" else f"equal_{args.size}"
+    size = "" if args.size == "s" else args.size
+    hours = f"{args.core_seconds / HOUR:g}h" if args.core_seconds > HOUR else ""
+    page = "_".join(filter(None, ("equal", size, hours)))
     head = ("policy", "seed", "pace", "env steps", "core-seconds before training", "in all", *SHARES)
     return Report(
-        "Learners at equal cost" if args.size == "s" else f"Learners at equal cost, size {args.size}",
+        ", ".join(filter(None, ("Learners at equal cost", size and f"size {size}", hours and f"{hours} of a core"))),
         results,
         [
             Table(head, rows, f"Share of sealed levels of {args.size} solved with sampled actions; 95% intervals"),

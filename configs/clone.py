@@ -15,7 +15,7 @@ class CloneConfig:
     where: str = "label = 'solved'"  # SQL condition on the manifest's columns that selects levels
     episodes: Literal["first", "all"] = "first"  # first: each record up to its first goal; all: whole records
     mirror: bool = False  # also learn from mirrored witnesses that solve their mirrored level
-    validation: float = 0.1  # share of the levels that are kept from training, chosen by content hash
+    validation: float = 0.1  # share of the levels that are held out for validation, chosen by content hash
     pool: int = 16_384  # levels in memory, drawn evenly; if the splits have more, the next pool is read ahead
     refresh: int = 1000  # updates until other levels replace those in memory, if the splits have more
     interval: int = 500  # updates between validations, each with a checkpoint

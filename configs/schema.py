@@ -104,7 +104,7 @@ class JobConfig:
         last = self.first_level + parse_count(self.levels, "levels") - 1
         if self.first_level < 0 or last > MAX_LEVEL_ID:
             raise ConfigError(
-                f"first_level and levels give ids {self.first_level} to {last}: keep them from 0 to {MAX_LEVEL_ID}."
+                f"first_level and levels give ids {self.first_level} to {last}: keep them between 0 and {MAX_LEVEL_ID}."
             )
         self._check_budget()
         if self.unit is not None and self.unit < 1:

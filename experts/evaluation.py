@@ -225,7 +225,7 @@ def _begun(level: Level, key: Key[Array, " lane"]) -> _Attempt:
 
 
 def _step(player: Player, params: Any, attempt: _Attempt, rules: TaskParams) -> tuple[_Attempt, StepResult]:
-    """Take an env step in every lane, whatever happened before."""
+    """Take an env step in every lane, even if its episode has ended."""
     level, now = attempt.level, attempt.now
     draw = lambda key, step: jax.random.uniform(jax.random.fold_in(key, step), (ACTIONS,))
     uniform = jax.vmap(draw, out_axes=-1)(attempt.key, now.timestep)

@@ -51,7 +51,7 @@ def add_body(level: Level, shape: str, x: float, y: float) -> Level:
             corners = np.array(SHAPES[shape], np.float32) * HALF_SIDE
             model.n_vertices[body], model.vertices[body] = len(corners), 0.0
             model.vertices[body][: len(corners)] = corners
-            # Pixels draw a triangle's unused corner, too, as the reference's do: put it on the side that closes it
+            # Pixels draw a triangle's unused corner, too, as the reference does: put it on the triangle's closing side
             model.vertices[body][len(corners) :] = (corners[0] + corners[-1]) / 2
         model.active[body], model.collision_mode[body] = True, NORMAL
         model.friction[body], model.restitution[body] = 1.0, 0.0

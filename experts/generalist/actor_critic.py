@@ -1,4 +1,4 @@
-"""A policy for all levels with a value function, which starts from the policy's own summary of a lane."""
+"""A policy for all levels with a value function, whose input is the policy's own summary of a lane."""
 
 from typing import Any, NamedTuple
 

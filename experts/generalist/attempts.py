@@ -80,7 +80,7 @@ def play_varied(params: Recalled, moment: Moment) -> Int[Array, "6 lane"]:
 
 
 def recalled(witness: Int8[Array | np.ndarray, "256 6 state"], attempts: int) -> Recalled:
-    """Return variations of witnesses: the first attempt is unchanged, others are ever noisier, some shifted."""
+    """Return variations of witnesses: the first is unchanged, later ones are increasingly noisy, some shifted."""
     number = np.tile(np.arange(attempts), witness.shape[-1])
     spread = (number // 2 * 7) % (2 * MAX_SHIFT + 1) - MAX_SHIFT
     shift = np.where(number % 2, spread, 0)

@@ -50,7 +50,7 @@ def learnability(config: LearnabilityConfig) -> Curriculum:
         episodes, solved = attempt(candidates, config.measured_steps, of_attempts)
         candidates, episodes, solved = by_level(candidates, episodes, solved)
         rate = solved / jnp.maximum(episodes, 1)
-        # As in the authors' code, n / (n + 1) holds back rates of few episodes n
+        # As in the authors' code, n / (n + 1) scales down scores from few episodes n
         score, best = jax.lax.top_k(rate * (1 - rate) * episodes / (episodes + 1), config.keep)
         return Learnable(candidates[best], (score > 0).sum(dtype=jnp.int32))
 

@@ -61,7 +61,7 @@ class Experience(NamedTuple):
 
 def lanes_of(size: Size, rules: TaskParams) -> Lanes:
     """Return the environment in lanes, for levels of any table."""
-    unused = ObservationType.SYMBOLIC_ENTITY  # never computed: networks see for themselves
+    unused = ObservationType.SYMBOLIC_ENTITY  # never computed: networks derive their own inputs
     return Lanes(environment.make(sampler(size), observation_type=unused, rules=rules)[0])
 
 

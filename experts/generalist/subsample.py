@@ -2,7 +2,7 @@
 
 Most samples teach little: in a level that the policy always solves, or never does, the advantage is near 0. The
 gradient takes most of the time of an update, so learning from a part of the samples, those of large advantages more
-often, lets as much time see more levels. Weights undo the preference: a weighted mean over the chosen samples has the
+often, covers more levels in equal time. Weights undo the preference: a weighted mean over the chosen samples has the
 expectation of the mean over all (importance sampling, as Katharopoulos and Fleuret 2018, arXiv:1803.00942, choose
 samples by a bound of their gradient's norm).
 """
@@ -37,7 +37,7 @@ def choose(
     edges = jnp.cumsum(chance, 1)
     total = edges[:, -1:]
     at = (jnp.arange(samples) + jax.random.uniform(key, (len(gain), 1))) / samples * total
-    at = jnp.minimum(at, jnp.nextafter(total, jnp.zeros_like(total)))  # rounded up to the total it would be beyond all
+    at = jnp.minimum(at, jnp.nextafter(total, jnp.zeros_like(total)))  # rounding up to the total would pass every lane
     lane = jnp.minimum(jax.vmap(lambda edge, x: jnp.searchsorted(edge, x, side="right"))(edges, at), gain.shape[1] - 1)
     own = jnp.take_along_axis(chance, lane, 1)
     return lane, jnp.where(own > 0, total / (gain.shape[1] * jnp.where(own > 0, own, 1.0)), 0.0)

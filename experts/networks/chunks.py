@@ -22,7 +22,7 @@ P = TypeVar("P")
 def lanes_at_once(size: Size, lanes: int) -> int:
     """Return the number of lanes of a chunk, a divisor of `lanes`.
 
-    On a CPU these are few, unless no divisor is near to what fits the cache; then, and on a GPU, all.
+    On a CPU, the largest divisor that fits the cache; if it is under about a quarter of what fits, or on a GPU: all.
     """
     if jax.default_backend() != "cpu":
         return lanes

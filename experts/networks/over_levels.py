@@ -40,7 +40,7 @@ class PolicyKind(StrEnum):
     PIXELS = "pixels"  # convolutions on a picture
 
 
-MAX_WIDTH, MAX_DEPTH, MAX_HEADS = 1024, 16, 64  # a policy's folder may be a stranger's
+MAX_WIDTH, MAX_DEPTH, MAX_HEADS = 1024, 16, 64  # a policy's folder may be untrusted
 LANE_BY_LANE = (PolicyKind.INVARIANT, PolicyKind.FLAT)  # kinds whose module sees one level at a time
 
 

@@ -124,7 +124,7 @@ def load_policy(folder: str | os.PathLike[str]) -> Policy:
     """
     path = policy_folder(folder)
     try:
-        if not all((path / name).is_file() for name in (CONFIG, WEIGHTS)):  # to read a pipe would wait
+        if not all((path / name).is_file() for name in (CONFIG, WEIGHTS)):  # reading a pipe would block
             raise FileNotFoundError
         config = json.loads(_read(path / CONFIG, MAX_CONFIG))
         if index(config["format"]) != FORMAT:

@@ -35,7 +35,7 @@ class SearchConfig:
     bodies: int = 0  # worlds up to this many bodies get all env steps; n bodies get (bodies/n)² of them; 0: no scaling
     variations: int = 262_144  # env steps after the search, on variations of the nearest trajectories; 0: none
     patience: int = 524_288  # env steps without progress before a level leaves (variations: a quarter); 0: no limit
-    patience_gap: float = 0.1  # m, gap of green and blue beyond which patience falls as 1/gap, to a quarter; 0: never
+    patience_gap: float = 0.1  # m, green-blue gap beyond which patience falls as 1/gap, to a quarter; 0: never
     first_rung: int = 16_384  # env steps at the first rung; each rung quadruples them
     per_cell: int = 512  # maximum env steps per cell reached for a level to pass a rung; 0: no limit
     # play

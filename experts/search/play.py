@@ -23,7 +23,7 @@ from levelproof.physics.step import step
 from levelproof.physics.types import State
 
 CODES = math.prod(CHOICES)  # number of actions
-UNROLLED = 8  # physics steps of an env step up to which the program repeats them instead of looping
+UNROLLED = 8  # maximum physics steps per env step that the program unrolls; more run in a loop
 T = TypeVar("T")
 
 

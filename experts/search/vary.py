@@ -2,7 +2,7 @@
 
 Each level keeps the few trajectories that brought green and blue nearest to each other, at first those to the nearest
 states in its archive. A lane plays a variation of one of them from the level's start: stretches are resampled or
-shifted in time. If the variation came nearer than a kept trajectory, it replaces it; then the lane plays another.
+shifted in time. If a variation comes nearer than a kept trajectory, it replaces that one; then the lane plays another.
 Go-Explore resamples all actions after the state it returns to; a variation keeps the actions after a change, so it can
 correct an aim.
 """

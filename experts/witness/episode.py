@@ -96,7 +96,7 @@ def play_episodes(
     ends = np.cumsum(steps)
     first, rows = ends - steps, None
     constants: list[np.ndarray] = []
-    groups = -(-len(steps) // AT_ONCE)  # of equal sizes: of more than one, each has MANY
+    groups = -(-len(steps) // AT_ONCE)  # of nearly equal size; if there are several, each has at least MANY
     edges = [len(steps) * group // groups for group in range(groups + 1)]
     for some in itertools.starmap(slice, itertools.pairwise(edges)):
         mine = slice(first[some.start], ends[some][-1])

@@ -216,7 +216,7 @@ class Environment:
             terminated: whether the task ended the episode; the value of the next state is then 0.
             truncated: whether the time limit ended it; a value function bootstraps from the final observation.
             level_index: index of the step's level in `params.levels`, or its id (as `EnvState.level_index`).
-            final_observation: observation at the end of the step, before any reset; only if `make` got this option.
+            final_observation: observation at the end of the step, before any reset; only if `make` enabled it.
         """
         self._check(action)
         if not self.auto_reset:

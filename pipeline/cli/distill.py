@@ -1,4 +1,4 @@
-"""`levelproof distill`: train one policy on the labels that teachers give at its own states."""
+"""`levelproof distill`: train one policy on teachers' labels for states that it visits."""
 
 import argparse
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 from levelproof.pipeline.cli.command import parted
 from levelproof.pipeline.errors import UserError
 
-SUMMARY = "train one policy on labels that teachers give at its own states"
+SUMMARY = "train one policy on teachers' labels for states that it visits"
 EXAMPLE = """\
 levelproof distill data/128k/s start=policy/ -o distilled/
 levelproof distill masters/256k/s states=0 demonstrations=128 -o shown/"""

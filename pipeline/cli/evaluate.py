@@ -6,7 +6,7 @@ from pathlib import Path
 from levelproof.pipeline.cli.command import add_json
 from levelproof.pipeline.errors import UserError
 
-SUMMARY = "measure how often a policy solves levels, beside doing nothing and random play"
+SUMMARY = "measure how often a policy solves levels, compared with doing nothing and with random play"
 EXAMPLE = """\
 levelproof evaluate policy/
 levelproof evaluate policy/ --on data/128k/s --where "label = 'solved'" --start 0 0.5
@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> None:
         raise UserError("--experts rates episodes from the levels' start: leave out --start.")
     for share in arguments.start:
         if not 0 <= share < 1:
-            raise UserError(f"--start is {share}: it must be from 0 to below 1.")
+            raise UserError(f"--start is {share}: it must be at least 0 and below 1.")
     from levelproof.pipeline.learn.evaluate import evaluate, is_named
     from levelproof.pipeline.urls import require_known
 

@@ -102,7 +102,7 @@ def run(arguments: argparse.Namespace) -> None:
     if level_id is not None:
         raise UserError(
             f"The format {arguments.format} is for a split, not for level {level_id} alone: "
-            f'select it with --where, as in --where "level_id = {level_id}".'
+            f'select the level with --where, as in --where "level_id = {level_id}".'
         )
     if out is None:
         kind, name = ("file", "levels.parquet") if arguments.format == "seed" else ("folder", arguments.format)

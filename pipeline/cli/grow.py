@@ -1,11 +1,11 @@
-"""`levelproof grow`: make a split of seed files."""
+"""`levelproof grow`: make a split from seed files."""
 
 import argparse
 from pathlib import Path
 
 from levelproof.pipeline.errors import Exit
 
-SUMMARY = "make a split of seed files, with every witness replayed and checked"
+SUMMARY = "make a split from seed files, with every witness replayed and checked"
 EXAMPLE = """\
 levelproof grow levels.parquet -o grown/256k/s
 levelproof grow seeds/256k/s -o grown/256k/s density=witness executor=inline"""

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from levelproof.pipeline.errors import Exit
 
-SUMMARY = "make a split of trajectories in Kinetix' format"
+SUMMARY = "make a split from trajectories in Kinetix's format"
 EXAMPLE = "levelproof import kinetix/1M/s -o data/1M/s"
 FOLDER = "a zarr v2 group of trajectories, as in the released data or from export --format kinetix"
 OUT = "the split to make or continue: FOLDER/BUDGET/SIZE, where BUDGET is the budget of the imported experts"

@@ -1,11 +1,11 @@
-"""`levelproof seal`: merge many small files into few large ones."""
+"""`levelproof seal`: merge many small files into a few large ones."""
 
 import argparse
 from pathlib import Path
 
 from levelproof.pipeline.cli.command import add_split
 
-SUMMARY = "merge a split's many small files into few large ones"
+SUMMARY = "merge a split's many small files into a few large ones"
 EXAMPLE = """levelproof seal data/128k/s
 levelproof seal data/128k/s --density witness --key-every 16
 levelproof seal data/128k/s --density seed -o levels.parquet    one file of ids and actions; the split stays"""

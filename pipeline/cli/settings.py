@@ -21,7 +21,7 @@ INTRODUCTION = """# Settings
 
 Every setting of `levelproof generate` with its default, as typed on the command line: `levelproof generate size=m \
 budget=64k`. `levelproof settings WORD` searches them. A name in brackets or parentheses is the field or function of \
-the reference, Kinetix 3.0.2, that has the number. `levelproof settings --markdown` writes this page, from the \
+the reference, Kinetix 3.0.2, that the value comes from. `levelproof settings --markdown` writes this page, from the \
 comments on the dataclasses' fields.
 """
 

@@ -62,7 +62,7 @@ class WorkerActor:
             self._working = False
 
     def leave(self, heard: int) -> list[Round]:
-        """Commit decided levels and leave; return the last round, after the one before if the driver `heard` fewer."""
+        """Commit decided levels and leave; return the last round, after any that the driver has not `heard`."""
         return [*([self._latest] if self._rounds > heard else []), self._worker.leave()]
 
     def _on_sigterm(self, number: int, frame: Any) -> None:

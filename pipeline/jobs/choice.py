@@ -9,7 +9,7 @@ from levelproof.pipeline.runtime import own_cores
 
 MANY = 16  # levels; a job of fewer may compile programs that it does not use, and leave slots of its programs empty
 MAX_THREADS = 6  # workers in one process: Python, unlike compiled code, runs in one thread at a time
-PARTS = 2  # of an untimed work unit; with fewer levels, workers would leave most slots empty, and units be tiny
+PARTS = 2  # maximum workers per untimed work unit; with more, most slots would be empty and units tiny
 SMALL = 2  # untimed work units; a process makes them in the time in which Ray and its workers start
 DEFAULT_BUDGET = parse_count(JobConfig.budget, "budget")  # env steps; the search, which it does not limit, takes longer
 
@@ -35,7 +35,7 @@ def runs_here(job: JobConfig, levels: int) -> bool:
 def most_workers(job: JobConfig, levels: int) -> int:
     """Return the number of Ray workers that a job can use: `job.workers`, or fewer if it has few levels.
 
-    Each has a work unit or, if time decides how large units are, half of an untimed one, in smaller units.
+    Each needs the levels of a work unit or, if units are timed, of half an untimed one (cut into smaller units).
     """
     parts = 1 if job.unit or isinstance(job, GrowConfig) else PARTS  # records grow within milliseconds
     each = max(1, job.levels_per_unit // parts)

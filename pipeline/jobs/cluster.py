@@ -286,7 +286,7 @@ class Crew:
         """Exclude a machine, because it has another program or does not see the split.
 
         Raises:
-            LeaseLost: it is not seen anywhere, because another command has taken it over.
+            LeaseLost: no machine can see the split, because another command has taken it over.
             Failure: no other worker is left.
         """
         require_served(self._split)

@@ -80,7 +80,7 @@ def _job(source: Path, out: Path, settings: Sequence[str], config: dict) -> Grow
     path = out.absolute()
     if (path.parent.name, path.name) != (budget, size):
         raise UserError(
-            f"The seeds have size {size} and budget {budget}, which the name of the split {out} must end in: use "
+            f"The seeds have size {size} and budget {budget}, but {out} does not end in {budget}/{size}: use "
             f"-o data/{budget}/{size}."
         )
     chosen = compose_job(settings)

@@ -78,7 +78,7 @@ def report_lines(job: JobConfig, sample: Sample, cost: Forecast) -> list[str]:
     return [
         f"{many(cost.levels, 'level')} of size {job.size}, budget {job.budget}:",
         *(f"  {name + ':':30} {text}" for name, text in lines.items()),
-        f"Measured on {len(sample.busy)} of them, made on {sample.workers} {sample.device}s here in "
+        f"Measured on {len(sample.busy)} of these levels, made on {sample.workers} {sample.device}s here in "
         f"{duration(sample.wall)}; {LIKELY:.0%} of outcomes fall within the intervals. This assumes workers as fast as "
         f"those here, {duration(sample.once)} for starting and for the last levels, and programs already compiled "
         f"(else {duration(sample.compiling)} more per worker).",

@@ -18,7 +18,7 @@ from levelproof.pipeline.words import duration
 LINE_AFTER = 2.0  # s between plain lines that report commits; the last commit is always reported
 STOPPING = "Stopping once decided levels are committed; press Ctrl-C to quit now."
 PACE_OVER = 60.0  # s over which env steps/s and the remaining time are averaged
-PACE_EVERY = 1.0  # s at least between two samples of the pace: of two close ones, the quotient means nothing
+PACE_EVERY = 1.0  # minimum s between two samples of the pace: the quotient of closer ones is meaningless
 
 
 @dataclass
@@ -148,7 +148,7 @@ class Meters:
     def __init__(self, split: Path, gauge: Callable[[str, str, tuple[str, ...]], Any]) -> None:
         """`gauge` creates a gauge from its name, its description and the names of its tags."""
         self._split = {"split": "/".join(split.parts[-2:])}
-        meanings = {"levels": "levels committed", "solved": "of them solved", "env_steps": "env steps of this run"}
+        meanings = {"levels": "levels committed", "solved": "solved levels", "env_steps": "env steps of this run"}
         self._gauges = {name: gauge(f"levelproof_{name}", what, ("split",)) for name, what in meanings.items()}
 
     def show(self, tally: Tally) -> None:

@@ -84,7 +84,7 @@ def repair(split: Path, settings: Sequence[str], console: Console) -> Exit:
 
 
 def _examine_split(split: Path, job: JobConfig) -> Findings:
-    """Examine the split on the device that would make its lost levels again: it finds those that another one made.
+    """Examine the split on the device that would regenerate lost levels, to find levels that another device made.
 
     In another process if Ray will fork this one, which must not have started JAX before.
     """

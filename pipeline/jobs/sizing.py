@@ -11,7 +11,7 @@ WORK = 40.0  # s of a worker per unit; 20 to 60 after rounding to whole levels
 UNITS_EACH = 4  # minimum number of units per worker, if the job has enough levels
 MAX_FACTOR = 16  # maximum size of a unit, in untimed units: a worker holds several copies of its records (0.1-0.2 GB)
 RECENT = 31  # latest units, whose median gives the time of a level
-STEP = 4  # maximum growth over the largest of them: the first units to end have quick levels, untypical of the others
+STEP = 4  # maximum growth over the largest recent unit: the first units to end have untypically quick levels
 
 
 def unit_levels(seconds: float | None, levels: int, workers: int, untimed: int) -> int:

@@ -86,7 +86,7 @@ def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, run: TrainingRun) -
 
 
 def failure(split: Path, unit: WorkUnit, error: Exception) -> UnitOutcome:
-    """Return a failed attempt as a value, because exceptions may not survive the way to another process."""
+    """Return a failed attempt as a value, because exceptions may not survive pickling."""
     reason, fatal = "".join(traceback.format_exception(error)), ""
     if isinstance(error, (UserError, SourceUnseen, LevelUnavailable, LeaseLost, StoreFailure, CheckpointUnread)):
         fatal = str(error)

@@ -1,4 +1,4 @@
-"""The workers of the kinds of jobs, which executors run without knowing which is which."""
+"""Choice of a job's worker, so that executors need not know the kind of job."""
 
 from pathlib import Path
 

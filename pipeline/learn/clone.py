@@ -200,7 +200,7 @@ def held_of(source: PartedSplit, config: CloneConfig) -> Held:
 
 
 def validated(state: Imitation, held: dict[str, Held], config: CloneConfig) -> dict[str, float]:
-    """Compare the averaged policy with the validation levels, of all splits and of each; let it play some of them."""
+    """Return validation metrics of the averaged policy, over all splits and for each; it also plays some levels."""
     params = state.average
     each = {
         name: ([compare(params, batch, config.network) for batch in one.batches], one.play and one.play(params))

@@ -23,7 +23,7 @@ class Panel(NamedTuple):
 
 
 class Curves(NamedTuple):
-    """What a kind of run draws."""
+    """Axis, panels and legend of one kind of run's curves."""
 
     step: str  # the metric that the others are plotted over
     unit: str  # unit of the step

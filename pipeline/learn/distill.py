@@ -135,7 +135,7 @@ def levels_for(split: Path, config: DistillConfig, tell: Callable[[str], None]) 
     require_some_usable(split, usable)
     trivial = np.array([label == Label.TRIVIAL for label in data.manifest["label"].to_pylist()])
     if not (usable & ~trivial).any():
-        raise UserError(f"{split} has only trivial levels that meet the condition: choose others with where.")
+        raise UserError(f"All levels of {split} that meet the condition are trivial: choose others with where.")
     chosen = np.flatnonzero(usable & ~trivial)
     if len(chosen) > config.pool:
         tell(f"Only {config.pool:,} of {len(chosen):,} levels of {split} are used, drawn once: raise pool for more.")

@@ -73,7 +73,7 @@ def require_same_run(out: Path, note: dict[str, Any], free: Sequence[str] = ()) 
             for name, change in changes.items()
             if name.startswith("settings.") or name == "cores"
         }
-        what = changes_text(named) or "the levels or the start differ"  # which digests would not explain
+        what = changes_text(named) or "the levels or the start differ"  # only digests differ, which tell users nothing
         raise UserError(f"{out} has a run with other settings or levels ({what}): repeat its command, or change -o.")
 
 
@@ -182,7 +182,7 @@ def require_finite(loss: float, setting: str) -> None:
 def origin_of(note: dict[str, Any], progress: dict[str, int], start: Policy | None = None) -> dict[str, Any]:
     """Return a policy's origin: what decides its run, how far the run is, and the policy that it started from, if any.
 
-    That policy's network is kept, so settings of another one are left out.
+    A run with a start keeps the start's network, so the settings of a new network are left out.
     """
     if start is None:
         return note | progress

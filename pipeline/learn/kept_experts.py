@@ -35,7 +35,7 @@ def experts_of(split: Path, level_ids: Int[np.ndarray, " level"], tell: Callable
     rows = manifest.table.to_pylist()
     if is_remote(split):
         if any(row["experts"] for row in rows):
-            tell(f"The experts that {as_typed(split)} kept are not asked: copy the split to this machine for that.")
+            tell(f"The experts kept in {as_typed(split)} are not used: copy the split to this machine to use them.")
         return no_experts(len(level_ids))
     by_file: dict[str, list[int]] = defaultdict(list)
     for row in rows:

@@ -100,7 +100,7 @@ def _joined(parts: Sequence[LevelPool]) -> LevelPool:
 
 
 def _cut(witnesses: Witnesses, whole: bool) -> LevelPool:
-    """Keep the steps that are trained on, and of states what moves."""
+    """Keep the steps to train on, and only the moving fields of their states."""
     done, moving = witnesses.done, len(MOTION_FIELDS)
     motion, contacts = witnesses.fields[:moving], witnesses.fields[moving:]
     count, length = done.shape
@@ -146,7 +146,7 @@ class Feed:
         config, over = self._config, Event()
 
         def follow(_: int) -> None:
-            """End the reading ahead, which is told of each read, once its pool will not be needed."""
+            """Called after each read: end the reading ahead once no update needs its pool."""
             if over.is_set():
                 raise CancelledError
 

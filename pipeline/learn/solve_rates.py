@@ -15,7 +15,7 @@ def solve_rates(solved: Solved, env_steps: Int[np.ndarray, "level attempt"] | No
     """Return one attempt's solve rate, that of the best of all attempts and that of the worst tenth, as JSON types.
 
     `steps` is the mean number of env steps of the attempts that reached the goal; None if none did, or if it is
-    unknown. Intervals hold 95% and are over levels, because attempts at one level are not independent. The worst tenth
+    unknown. Intervals are 95% intervals over levels, because attempts at one level are not independent. The worst tenth
     is chosen by the first half of the attempts and rated on the second: rated on those that chose it, it would look
     worse than it is. It includes all levels that tie with its last, so it may be larger than a tenth; its `levels` says
     how large. It is None for fewer than two attempts.

@@ -74,11 +74,11 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
     start = policy_at(Path(config.start)) if config.start else None
     if start:
         require_size(start, source.levels.size, source.name, "start from one that plays any size")
-        tell(f"Trains {config.start} on {source.name}.")
+        tell(f"Training {config.start} on {source.name}.")
     recipe = recipe_of(config, source, start, cores)
     if (share := config.ppo.samples(cores) * cores / config.ppo.environments) < config.ppo.subsample:
         why = f"each of {many(cores, 'core')} learns from a whole number of chunks of {CHUNK} lanes"
-        tell(f"Learns from {share:.1%} of the samples instead of {config.ppo.subsample:.1%}, because {why}.")
+        tell(f"The policy learns from {share:.1%} of samples, not {config.ppo.subsample:.1%}, because {why}.")
     note = note_of(config, source, cores)
     params = None if start is None else start.params
     with writing_run(out) as require_ours:
@@ -146,7 +146,7 @@ def curriculum_of(config: TrainConfig, levels: Level | Sampler, rules: TaskParam
         if config.curriculum.measured_steps < rules.max_timesteps:
             raise UserError(
                 f"curriculum.measured_steps is {config.curriculum.measured_steps}, but episodes have up to "
-                f"{rules.max_timesteps} env steps: those that fail late would not count, so raise it to that."
+                f"{rules.max_timesteps} env steps: late failures would not count, so raise it to at least that number."
             )
         return learnability(config.curriculum)
     if config.chosen_by == "replay":

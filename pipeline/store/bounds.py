@@ -1,7 +1,7 @@
 """Untrusted fragments and seed files: nothing is decompressed before its size is known.
 
 The reader checks the footer's length, the columns, the numbers of rows and row groups, and the headers of the pages
-that it reads. It parses these itself: if a footer lies, some calls of Arrow end the process. Strings are read as
+that it reads. It parses these itself: given a false footer, some Arrow calls crash the process. Strings are read as
 dictionaries, so that a short file cannot repeat a long string a million times, and are expanded only if their total is
 small; strings without a dictionary are as long as their pages.
 """

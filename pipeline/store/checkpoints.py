@@ -126,9 +126,9 @@ def require_plain(file: Path | IO[bytes], size: int) -> None:
 
 
 def experts_for(job: JobConfig, level_ids: Sequence[int]) -> dict[int, KeptExpert]:
-    """Load the experts of the split `job.continue_from` that can continue on these levels; all others start new.
+    """Load the experts of the split `job.continue_from` that can continue on these levels; other levels get new ones.
 
-    An expert that solved its level starts new, because it would end the same with any larger budget. It continues if
+    An expert that solved its level starts over, because it would end the same with any larger budget. It continues if
     experts use their whole budget, or if only the last evaluation solved the level. Whether the expert solved it
     follows from the witness or, if the witness is from a search around the expert's own, from the expert's course.
 

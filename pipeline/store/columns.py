@@ -192,7 +192,7 @@ DESCRIBED = (
         "seconds",
         pa.struct([pa.field(stage, pa.float32()) for stage in Seconds._fields]),
         "Seconds of a core (of a GPU if `device` is one) for the level: sampling (and labels without an expert), "
-        "search, training, evaluation, idle slots, replay of witnesses, writing, compiling; by the clock, so other "
+        "search, training, evaluation, idle slots, replay of witnesses, writing, compiling; wall-clock time, so other "
         "work on the core makes it longer",
         "s",
         "not measured",

@@ -1,4 +1,4 @@
-"""`job.json`: the levels that the last command requested and those already in the split, so that losses show."""
+"""`job.json`: the levels that the last command requested and those already in the split, to detect losses."""
 
 import hashlib
 import json

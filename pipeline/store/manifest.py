@@ -362,7 +362,7 @@ def require_manifest(
 
 
 def refuse_folder_of_splits(folder: Path) -> None:
-    """Raise UserError if a local folder holds splits, one to three folders further down; a URL may be any."""
+    """Raise UserError if a local folder contains splits one to three folders down; do not search below a URL."""
     patterns = [] if is_remote(folder) else [f"{above}{MANIFEST}" for above in ("*/", "*/*/", "*/*/*/")]
     below = sorted(path.parent for pattern in patterns for path in folder.glob(pattern))
     if below:

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 LINE_EVERY = 30.0  # s between plain lines
-ON_TERMINAL = Lock()  # held by the bar on the terminal: one within its block, as of a read, would draw over it
+ON_TERMINAL = Lock()  # held by the bar on the terminal: a bar nested in its block, such as a read's, would overwrite it
 
 
 class ProgressBar:

@@ -38,7 +38,7 @@ BUDGET = r"[A-Za-z0-9._]{1,32}"
 
 @dataclass(frozen=True)
 class SeedFile:
-    """What a seed file says of itself."""
+    """Metadata of a seed file."""
 
     fragment: Fragment
     budget: str  # as typed

@@ -43,7 +43,7 @@ def test_report_names_units_and_unknown_costs() -> None:
     lines = report_lines(made_job("data", "levels=6M"), some, forecast(some, 6_000_000, 64, 32))
     assert lines[0] == "6,000,000 levels of size s, budget 128k:"
     assert re.match(r"  wall time: +26 \(.* to .*\) hours with 64 workers$", lines[1])
-    assert lines[-1].startswith("Measured on 200 of them, made on 2 cores here in ")
+    assert lines[-1].startswith("Measured on 200 of these levels, made on 2 cores here in ")
     none = replace(some, solved=busy > 9)
     assert "core-seconds per solved level: unknown" in " ".join(
         " ".join(line.split()) for line in report_lines(made_job("data"), none, forecast(none, 100, 2, 32))

@@ -212,7 +212,7 @@ def test_experts_that_a_split_kept_are_those_of_their_levels(
     told = list[str]()
     monkeypatch.setattr(kept_experts, "is_remote", lambda _: True)
     assert experts_of(split, ids, told.append).config is None
-    assert told == [f"The experts that {split} kept are not asked: copy the split to this machine for that."]
+    assert told == [f"The experts kept in {split} are not used: copy the split to this machine to use them."]
 
 
 def test_experts_whose_updates_need_a_larger_budget_are_read(
@@ -271,7 +271,7 @@ def test_trivial_levels_are_left_out(tmp_path: Path) -> None:
     chosen = module.levels_for(split, DistillConfig(where=""), print)
     np.testing.assert_array_equal(chosen.chosen, np.flatnonzero(labels != Label.TRIVIAL))
     assert 0 < len(chosen.chosen) < len(data)
-    with pytest.raises(levelproof.UserError, match="only trivial levels"):
+    with pytest.raises(levelproof.UserError, match="meet the condition are trivial"):
         module.levels_for(split, DistillConfig(where="label = 'trivial'"), print)
 
 
