@@ -20,12 +20,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from rich.console import Console
-
     from levelproof.pipeline.look.status import status
     from levelproof.pipeline.look.watch import watch
+    from levelproof.pipeline.tables import console_for_tables
 
     if arguments.watch:
-        watch(arguments.split, arguments.json, Console(markup=False))
+        watch(arguments.split, arguments.json, console_for_tables())
     else:
         status(arguments.split, arguments.json, partial(print, file=sys.stderr))

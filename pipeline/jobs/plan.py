@@ -24,6 +24,7 @@ from levelproof.pipeline.jobs.forecast import LIKELY, Forecast, PerWitness, Samp
 from levelproof.pipeline.jobs.generate import generate
 from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.read.rows import read_rows
+from levelproof.pipeline.read.select import labelled
 from levelproof.pipeline.runtime import own_cores, prepare_jax
 from levelproof.pipeline.store.event_files import events_of, runs_in
 from levelproof.pipeline.store.formats import Encoding
@@ -104,7 +105,6 @@ def measure(job: JobConfig, console: Console, seconds: float = SECONDS) -> Sampl
             wall = _make(job, folder, count, here)
         table, busy, compiling = costs_of(split)
         new, compiled = (busy[some:], 0.0) if count > some else (busy, compiling.sum())
-        labels = np.array(table.column("label").to_pylist())
         prepare_jax()
         return Sample(
             device="GPU" if not table.column("device")[0].as_py().startswith("cpu") else "core",
@@ -113,8 +113,8 @@ def measure(job: JobConfig, console: Console, seconds: float = SECONDS) -> Sampl
             once=max(0.0, wall - (new.sum() + compiled) / here),
             compiling=compiling[:some].sum() / here,
             busy=busy,
-            solved=labels == Label.SOLVED,
-            witnessed=np.isin(labels, [label.value for label in WITNESSED]),
+            solved=labelled(table, [Label.SOLVED]),
+            witnessed=labelled(table, WITNESSED),
             row_bytes=_row_bytes(table),
             stored=_stored(job, split, table, folder),
             expert_bytes=sum(file.stat().st_size for file in (split / EXPERTS).glob("*.npz")) / table.num_rows,

@@ -106,7 +106,7 @@ class Board:
         self.watchers: list[Callable[[float, float | None], None]] = []  # get env steps/s and s to go, at each refresh
 
     def shown(self) -> AbstractContextManager[object]:
-        return self._bar if self._console.is_terminal else nullcontext()
+        return self._bar if self._console.is_interactive else nullcontext()
 
     def refresh(self, every: float = LINE_EVERY) -> None:
         """Update the bar, or print a line unless one was printed in the last `every` seconds."""
@@ -118,7 +118,7 @@ class Board:
         for watcher in self.watchers:
             watcher(steps.speed or 0.0, levels.time_remaining)
         text, now = self.tally.text(steps.speed or 0.0, levels.time_remaining), time.monotonic()
-        if self._console.is_terminal:
+        if self._console.is_interactive:
             self._bar.update(self._task, completed=self.tally.share, description=text)
         elif now - self._line_at >= every:
             self._line_at = now

@@ -16,6 +16,7 @@ from levelproof.configs.schema import JobConfig, from_files, hash_of
 from levelproof.pipeline.errors import Exit, Failure, UserError
 from levelproof.pipeline.jobs.generate import generate
 from levelproof.pipeline.jobs.progress import say
+from levelproof.pipeline.read.levels import recorded_settings
 from levelproof.pipeline.runtime import in_another_process, own_cores
 from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store.job_note import note_job, sound_note
@@ -122,15 +123,11 @@ def _job(split: Path, findings: Findings, settings: Sequence[str]) -> JobConfig:
     kept = findings.names_experts or any(path.parent.name == EXPERTS for path in data_paths(split))
     files = [f"level_files={split}"] if from_files(config) else []
     budget = f"budget={findings.budget or _budget(split, config['budget'])}"
-    try:
+    with recorded_settings(split):
         # Of settings that are named twice, the last one counts
         how = [*_noted(split), *(["keep_experts=true"] if kept else []), *findings.stored.split()]
         job = compose_job([*changed_settings(config), budget, *files, *how, *settings])
         job = replace(job, size=config["size"])
-    except (ConfigError, ValueError, KeyError, TypeError) as error:
-        raise Failure(
-            f"This levelproof does not accept the settings of {split} ({error}): use the version that made it."
-        ) from None
     if job.hash != hash_of(config):
         raise Failure(f"This levelproof would make {split} with other settings: use the version that made it.")
     return job

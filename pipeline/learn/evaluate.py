@@ -36,10 +36,10 @@ from levelproof.pipeline.read.agents import Agent, agent_in
 from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.progress_bar import ProgressBar
+from levelproof.pipeline.tables import console_for_tables, print_table
 from levelproof.pipeline.words import many
 
 ATTEMPTS = 8
-WIDE = 120  # columns of a table that no terminal shows: in 80, Rich would cut long rates
 NOTHING, POLICY, OTHER, AGENT = "doing nothing", "policy", "other", "agent"
 ALL, NOT_TRIVIAL, SOLVED = "all", "that doing nothing does not solve", "labelled solved"  # denominators
 
@@ -103,7 +103,7 @@ def evaluate(
 def _print_all(facts: Sequence[dict[str, Any]], attempts: int) -> None:
     """Print the tables of all groups of levels, and what they need to be read."""
     for group in facts:
-        _print(group, attempts, Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else WIDE))
+        _print(group, attempts, console_for_tables())
     print("In brackets: 95% intervals over levels.")
     if any(group["published"] for group in facts):
         agents = ", ".join(f"{name} ({steps} env steps on {levels})" for name, (steps, levels) in AGENTS.items())
@@ -290,7 +290,7 @@ def _print(facts: dict[str, Any], attempts: int, console: Console) -> None:
             table.add_row(name, *(_shown_rate(rates[key]) for key in ("once", "best", "worst")), steps)
         for name, rate in facts["published"].items() if title == ALL else ():
             table.add_row(name, f"{rate:.0%}", "-", "-", "-")
-        console.print(table)
+        print_table(table, console)
         if apart := facts.get("difference", {}).get(title):
             low, high = (f"{100 * x:+.1f}" for x in apart["interval"])
             ours = AGENT if AGENT in players else POLICY

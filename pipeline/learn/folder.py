@@ -212,14 +212,14 @@ def shown(console: Console, first: str, total: int, completed: int) -> Iterator[
     Yields a function that advances the bar by a count and changes its text; with `keep` the text also stays as a line.
     """
     columns = BarColumn(), TaskProgressColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+    with Progress(*columns, console=console, disable=not console.is_interactive) as bar:
         task = bar.add_task(first, total=total, completed=completed)
         line_at = time.monotonic()
 
         def show(count: int, text: str, keep: bool = False) -> None:
             nonlocal line_at
             bar.update(task, advance=count, description=text)
-            if keep or (not console.is_terminal and time.monotonic() - line_at >= LINE_EVERY):
+            if keep or (not console.is_interactive and time.monotonic() - line_at >= LINE_EVERY):
                 line_at = time.monotonic()
                 say(console, text)
 

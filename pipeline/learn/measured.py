@@ -14,14 +14,14 @@ from levelproof.configs.schema import JobConfig
 from levelproof.experts.labels import Label
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.level import Level, name_of, size_of
-from levelproof.levelgen.sampling.sampler import check_size, sample_levels
+from levelproof.levelgen.sampling.sampler import check_size, on_cpu, sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.learn.sealed import SEALED, known_sealed
 from levelproof.pipeline.read.level_files import levels_at, levels_below
 from levelproof.pipeline.read.levels import COLUMNS, levels_of, rules_of
-from levelproof.pipeline.read.select import require_selected
+from levelproof.pipeline.read.select import labelled, require_selected
 from levelproof.pipeline.store.job_note import sound_note
 from levelproof.pipeline.store.manifest import fragment_paths, refuse_folder_of_splits, require_manifest
 from levelproof.pipeline.store.remote import as_typed, is_remote
@@ -63,7 +63,9 @@ def sealed_levels(size: str, count: int | None) -> MeasuredLevels:
     ids = np.array(SEALED[:count], np.int32)
     known = known_sealed(size)
     solved = known and known.solved[:count]
-    return MeasuredLevels(f"sealed {size}", ids, sample_levels(ids, size), DEFAULT_RULES, solved)
+    with on_cpu():  # where they were labelled
+        levels = sample_levels(ids, size)
+    return MeasuredLevels(f"sealed {size}", ids, levels, DEFAULT_RULES, solved)
 
 
 def is_split(place: Path) -> bool:
@@ -111,8 +113,7 @@ def _of_split(split: Path, where: str | None, count: int | None) -> MeasuredLeve
         raise UserError(
             f"{split} has no level that meets the condition: `levelproof inspect {split}` shows its levels."
         )
-    levels, labels = levels_of(manifest, rows), rows["label"].to_pylist()
-    solved = np.array([label == Label.SOLVED for label in labels])
+    levels, solved = levels_of(manifest, rows), labelled(rows, [Label.SOLVED])
     name = f"{as_typed(split)}, {name_of(levels.size)}"
     return MeasuredLevels(name, rows["level_id"].to_numpy(), levels, rules_of(manifest), solved)
 
@@ -132,6 +133,6 @@ def midway_levels(data: Dataset, count: int | None, start: float) -> MeasuredLev
     parts = [data.state(witnessed[i : i + AT_ONCE], at[i : i + AT_ONCE]).level for i in range(0, len(at), AT_ONCE)]
     levels = jax.tree.map(lambda *xs: np.moveaxis(np.concatenate(xs), 0, -1), *parts)
     name = f"{as_typed(data.split)}, {name_of(data.size)}, {start:.0%} into witnesses"
-    solved = np.array([label == Label.SOLVED for label in data.manifest["label"].take(pa.array(witnessed)).to_pylist()])
+    solved = labelled(data.manifest, [Label.SOLVED])[witnessed]
     ids = data.manifest["level_id"].to_numpy()[witnessed]
     return MeasuredLevels(name, ids, levels, data.rules, solved, start)

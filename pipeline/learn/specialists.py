@@ -19,6 +19,7 @@ from levelproof.pipeline.learn.measured import MeasuredLevels
 from levelproof.pipeline.learn.sealed import known_sealed
 from levelproof.pipeline.learn.solve_rates import Solved
 from levelproof.pipeline.read.levels import COLUMNS, levels_of
+from levelproof.pipeline.read.select import labelled
 from levelproof.pipeline.store.manifest import require_manifest
 from levelproof.pipeline.store.seed.file import is_seed
 
@@ -113,7 +114,7 @@ def sealed_specialists(size: str, count: int, attempts: int) -> list[Specialists
 def successes_of(rows: pa.Table, attempts: int) -> Int[np.ndarray, " level"]:
     """Return in how many of its `attempts` each row's expert reached the goal: all if the level is trivial."""
     rates = rows["success_rate"].fill_null(0.0).to_numpy()
-    rates = np.where(np.array(rows["label"].to_pylist()) == Label.TRIVIAL, 1.0, rates)
+    rates = np.where(labelled(rows, [Label.TRIVIAL]), 1.0, rates)
     return np.round(rates * attempts).astype(np.int64)
 
 

@@ -111,10 +111,12 @@ def _require_ours(out: Path) -> None:
 
 def _require_own_names(facts: Sequence[SplitFacts]) -> None:
     """Refuse splits whose subsets on the hub, and previews, would have the same name."""
-    paths: dict[str, str] = {}
+    paths = {PREVIEW: "the pictured sample"}
+    previews: dict[str, str] = {}
     for split in facts:
-        if (other := paths.setdefault(split.subset, split.path)) != split.path:
-            raise UserError(f"Both {other} and {split.path} would be the subset {split.subset}: rename one of them.")
+        for names, name, kind in ((paths, split.subset, "subset"), (previews, split.preview, "preview")):
+            if (other := names.setdefault(name, split.path)) != split.path:
+                raise UserError(f"Both {other} and {split.path} would be the {kind} {name}: rename one of them.")
 
 
 def _require_plain(paths: Iterable[Path]) -> None:

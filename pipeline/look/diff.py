@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from jaxtyping import Bool
 from rich.console import Console
 from rich.table import Table
 
@@ -21,9 +20,10 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look import cost
 from levelproof.pipeline.look.inspect import QUANTILES, SPENT
 from levelproof.pipeline.look.query import prepare_for_seeds
-from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.read.select import columns_in, labelled, select
 from levelproof.pipeline.store.manifest import Manifest, changes_text, differences, require_manifest
 from levelproof.pipeline.store.remote import as_typed
+from levelproof.pipeline.tables import console_for_tables, print_table
 from levelproof.pipeline.words import number
 
 READ = (*cost.READ, "content_hash", "signature", "steps_to_goal", *SPENT)
@@ -43,7 +43,7 @@ def diff(one: Path, other: Path, where: str | None, rows: int, as_json: bool) ->
         json.dump(facts, sys.stdout, indent=2, allow_nan=False)
         print()
     else:
-        _print(facts, Console(highlight=False, markup=False))
+        _print(facts, console_for_tables())
 
 
 def compare(one: Path, other: Path, where: str | None = None, rows: int = 10) -> dict[str, Any]:
@@ -52,8 +52,8 @@ def compare(one: Path, other: Path, where: str | None = None, rows: int = 10) ->
     manifests = [require_manifest(split, [*READ, *columns], compact=True) for split, columns in reads]
     chosen = select(manifests[0].table, where)
     left, right = _common(chosen, manifests[1].table, (one, other))
-    solved, tried = np.stack([_labelled(rows, WITNESSED) for rows in (left, right)]), _labelled(left, TRAINED)
-    tried |= _labelled(right, TRAINED)
+    solved, tried = np.stack([labelled(rows, WITNESSED) for rows in (left, right)]), labelled(left, TRAINED)
+    tried |= labelled(right, TRAINED)
     only = [solved[i] & ~solved[1 - i] for i in range(2)]
     ids, gained = left["level_id"].to_numpy(), int(only[1].sum() - only[0].sum())
     spent = [_spent(side, manifest) for side, manifest in zip((left, right), manifests, strict=True)]
@@ -113,11 +113,6 @@ def _common(one: pa.Table, other: pa.Table, splits: tuple[Path, Path]) -> tuple[
                 "give two splits of one size and one distribution."
             )
     return left, right
-
-
-def _labelled(rows: pa.Table, labels: frozenset[Label]) -> Bool[np.ndarray, " row"]:
-    names = pa.array([label.value for label in labels])
-    return pc.is_in(rows["label"].cast(pa.string()), names).to_numpy().copy()  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _spent(rows: pa.Table, manifest: Manifest) -> dict[str, int] | None:
@@ -184,7 +179,7 @@ def _print(facts: dict[str, Any], console: Console) -> None:
             here, there = (side[quantile] for side in steps["quantiles"])
             name = "median" if quantile == "50%" else quantile
             table.add_row(f"steps to goal, {name}", f"{here:,.0f}", f"{there:,.0f}", f"{there - here:+,.0f}")
-    console.print(table)
+    print_table(table, console)
     say = lambda text: console.print(text, soft_wrap=not console.is_terminal)
     say("")
     one_sided = [

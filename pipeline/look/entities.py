@@ -16,6 +16,7 @@ from levelproof.physics.types import FIXED_POLYGONS
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.look.figures import Share
 from levelproof.pipeline.read.levels import COLUMNS, levels_of
+from levelproof.pipeline.read.select import labelled
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 
 ENTITIES = ("bodies", "joints", "motors", "thrusters")
@@ -44,15 +45,14 @@ def solved_by_entities(manifest: Manifest, ids: np.ndarray) -> dict[str, Any]:
     read = from_files(manifest.config or {})
     most = min(READ if read else SAMPLED, len(ids))
     rows = require_manifest(manifest.split, COLUMNS, ids[:most]).table
-    tried = np.isin(rows["label"].to_pylist(), [label.value for label in TRAINED])
-    rows = rows.filter(pa.array(tried))
+    rows = rows.filter(pa.array(labelled(rows, TRAINED)))
     facts: dict[str, Any] = {"levels": rows.num_rows, "sampled": most, "of": len(ids), "problem": None}
     if not rows.num_rows:
         return facts
     if not read:  # ids suffice: read no shards
         index = rows.schema.get_field_index("shard")
         rows = rows.set_column(index, "shard", pa.nulls(rows.num_rows, pa.string()))
-    solved = np.array([label == Label.SOLVED for label in rows["label"].to_pylist()])
+    solved = labelled(rows, [Label.SOLVED])
     try:
         levels = levels_of(manifest, rows)
     except (Failure, UserError) as error:  # the other facts need only the manifest

@@ -9,10 +9,11 @@ from rich.table import Table
 
 from levelproof.pipeline.look import cost, duplicates
 from levelproof.pipeline.look.entities import ENTITIES
+from levelproof.pipeline.tables import print_table
 
 NAMES = 33  # characters; column where the text of a line begins
 REASONS = 4  # shown per label; the rest are only counted
-STEPS = {
+STEPS = {  # columns of env steps, by stage, and what takes them
     "scout_steps": "random play",
     "search_steps": "search",
     "env_steps": "training",
@@ -33,7 +34,7 @@ def print_facts(facts: Mapping[str, Any], shown: Sequence[str], console: Console
         table.add_row(*(_cell(row[name]) for name in shown))
     if facts["rows"]:
         console.print()
-        console.print(table)
+        print_table(table, console)
 
 
 def _lines(facts: Mapping[str, Any]) -> dict[str, str | list[str]]:

@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from rich.console import Console
 
 from levelproof.configs.compose import name_and_hash
 from levelproof.experts.labels import DIVERGED, Label
 from levelproof.pipeline.look import cost, duplicates
 from levelproof.pipeline.look.entities import solved_by_entities
-from levelproof.pipeline.look.facts import print_facts
+from levelproof.pipeline.look.facts import STEPS, print_facts
 from levelproof.pipeline.look.figures import Share
 from levelproof.pipeline.look.query import ALL_ROWS, SHOWN, RowQuery, ids_of, prepare_for_seeds, rows_of
 from levelproof.pipeline.look.reasons import kinds_of_reasons
@@ -26,9 +25,10 @@ from levelproof.pipeline.read.select import columns_in, select
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 from levelproof.pipeline.store.named import bytes_named
 from levelproof.pipeline.store.remote import as_typed, is_listed
+from levelproof.pipeline.tables import console_for_tables
 
 QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
-SPENT = ("scout_steps", "search_steps", "env_steps", "evaluation_steps")  # env steps by stage
+SPENT = tuple(STEPS)
 READ = (  # manifest columns that the facts need
     "label", "label_reason", "failed_by_noop", "witness", "steps_to_goal", "steps_to_first_success", *SPENT, "shard",
 )  # fmt: skip
@@ -50,7 +50,7 @@ def inspect(split: Path, query: RowQuery, as_json: bool, against: Sequence[Path]
         json.dump(facts, sys.stdout, indent=2, allow_nan=False)
         print()
     else:
-        print_facts(facts, query.columns or SHOWN, Console(highlight=False, markup=False))
+        print_facts(facts, query.columns or SHOWN, console_for_tables())
 
 
 def survey(

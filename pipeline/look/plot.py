@@ -11,7 +11,7 @@ from levelproof.pipeline.look.figures import draw_panels
 from levelproof.pipeline.look.query import RowQuery, prepare_for_seeds
 from levelproof.pipeline.look.spread import spread
 from levelproof.pipeline.read.levels import writing_to
-from levelproof.pipeline.read.select import columns_in, select
+from levelproof.pipeline.read.select import columns_in, labelled, select
 from levelproof.pipeline.store.files import replacing
 from levelproof.pipeline.store.manifest import require_manifest
 from levelproof.pipeline.store.remote import as_typed
@@ -50,7 +50,7 @@ def plot(split: Path, query: RowQuery, out: Path) -> None:
 
 def _curves(split: Path, table: pa.Table, label: Label) -> list[np.ndarray]:
     """Read success rates per update of up to CURVES levels of a label; NaN where no episode ended."""
-    ids = table["level_id"].to_numpy()[np.array(table["label"].to_pylist()) == label]
+    ids = table["level_id"].to_numpy()[labelled(table, [label])]
     if not len(ids):
         return []
     chosen = ids[spread(len(ids), CURVES)]

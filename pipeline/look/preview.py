@@ -3,6 +3,7 @@
 import io
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import pyarrow as pa
@@ -13,6 +14,7 @@ from levelproof.levelgen.pictures.raster import rasterise
 from levelproof.levelgen.pictures.scene import scene_of
 from levelproof.levelgen.pictures.shapes import Scene
 from levelproof.levelgen.pictures.words import Caption
+from levelproof.pipeline.look.cost import with_known_costs
 from levelproof.pipeline.look.show import recorded_film
 from levelproof.pipeline.look.spread import spread
 from levelproof.pipeline.read.levels import levels_of, rules_of
@@ -34,7 +36,7 @@ RECORD_FIELDS = ("done", "goal", "action")
 IMAGE = pa.struct([pa.field("bytes", pa.binary()), pa.field("path", pa.string())])
 FEATURES = json.dumps({"info": {"features": {name: {"_type": "Image"} for name in PICTURES}}})
 SCHEMA = pa.schema(
-    [*(pa.field(name, IMAGE) for name in PICTURES), *(COLUMNS.field(name) for name in SHOWN)],
+    [*(pa.field(name, IMAGE) for name in PICTURES), *(COLUMNS.field(name).with_nullable(True) for name in SHOWN)],
     metadata={"huggingface": FEATURES},
 )
 
@@ -48,6 +50,7 @@ def preview(manifest: Manifest, count: int) -> pa.Table:
     ids = manifest.level_ids
     chosen = ids[spread(len(ids), count)]
     full = require_manifest(manifest.split, level_ids=chosen.tolist())
+    full = replace(full, table=with_known_costs(full))
     blocks = shown_blocks(full.table.num_rows, BLOCK, f"pictures of {manifest.split}")
     rows = [row for first in blocks for row in _pictured(full, full.table.slice(first, BLOCK))]
     return pa.Table.from_pylist(rows, SCHEMA)

@@ -11,6 +11,7 @@ import pyarrow as pa
 from rich.console import Console
 
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.look.cost import with_known_costs
 from levelproof.pipeline.outlet import has_reader
 from levelproof.pipeline.read.select import columns_in, ids_by, select
 from levelproof.pipeline.runtime import prepare_jax
@@ -58,7 +59,7 @@ def rows_of(split: Path, ids: np.ndarray, columns: Sequence[str] | None = None) 
     """Read the rows of these ids in this order, a block at a time."""
     for first in range(0, len(ids), BLOCK):
         wanted = ids[first : first + BLOCK]
-        table = require_manifest(split, columns, np.sort(wanted)).table
+        table = with_known_costs(require_manifest(split, columns, np.sort(wanted)))
         here = np.searchsorted(table.column("level_id").to_numpy(), wanted)
         yield table.take(here).select(columns or table.column_names)
 

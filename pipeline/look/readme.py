@@ -73,6 +73,11 @@ class SplitFacts:
         return re.sub(r"[^\w-]", "-", self.path.removesuffix(".parquet"))
 
     @property
+    def preview(self) -> str:
+        """Name of its preview in the hub's viewer, which allows no hyphen."""
+        return re.sub(r"\W", "_", self.path)
+
+    @property
     def levels(self) -> int:
         return sum(self.labels.values())
 
@@ -113,7 +118,7 @@ def readme(name: str, splits: Sequence[SplitFacts], options: CardOptions, figure
 
 def _header(name: str, splits: Sequence[SplitFacts], options: CardOptions) -> dict[str, Any]:
     total = sum(split.transitions for split in splits)
-    shown = [{"split": re.sub(r"\W", "_", split.path), "path": f"{PREVIEW}/{split.subset}.parquet"} for split in splits]
+    shown = [{"split": split.preview, "path": f"{PREVIEW}/{split.subset}.parquet"} for split in splits]
     configs: list[dict[str, Any]] = [{"config_name": PREVIEW, "default": True, "data_files": shown}]
     for split in splits:
         files = [{"split": SUBSET_SPLIT, "path": split.rows}]

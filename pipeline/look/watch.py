@@ -19,6 +19,7 @@ from levelproof.pipeline.outlet import has_reader
 from levelproof.pipeline.store.event_files import events_of, runs_in
 from levelproof.pipeline.store.layout import EVENTS
 from levelproof.pipeline.store.locks import is_written
+from levelproof.pipeline.store.progress_bar import LINE_EVERY
 from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.words import duration, many
 
@@ -32,7 +33,7 @@ FAILURE = {"unit", "cause"}
 def watch(split: Path, as_json: bool, console: Console, interval: float = INTERVAL) -> None:
     """Show a job's progress, refreshed until no run is active or the output has no reader.
 
-    With `as_json`, print one JSON object per refresh.
+    A file or pipe gets another table every LINE_EVERY seconds; with `as_json`, one JSON object per refresh.
 
     Raises:
         UserError: no split, or no run has logged its state.
@@ -40,9 +41,11 @@ def watch(split: Path, as_json: bool, console: Console, interval: float = INTERV
     read_status(split, partial(print, file=sys.stderr))  # raises if there is no split
     if as_json:
         _follow(split, interval, lambda facts: print(json.dumps(facts), flush=True))
-    else:
+    elif console.is_interactive:
         with Live(console=console, auto_refresh=False) as live:
             _follow(split, interval, lambda facts: live.update(progress_table(facts), refresh=True))
+    else:  # a live view would appear only when it ends
+        _follow(split, max(interval, LINE_EVERY), lambda facts: console.print(progress_table(facts)))
 
 
 def _follow(split: Path, interval: float, show: Callable[[dict[str, Any]], None]) -> None:

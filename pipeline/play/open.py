@@ -21,6 +21,7 @@ from levelproof.pipeline.read.levels import find_level, is_level_file, level_fil
 from levelproof.pipeline.read.policies import policy_at
 from levelproof.pipeline.read.rows import read_row
 from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store.manifest import require_manifest
 
 
 def play(
@@ -63,7 +64,7 @@ def level_to_play(source: Path | None, level_id: int | None, size: str | None) -
         file = require_playable(level_file(source, level_id))
         return file, witness_in(json.loads(source.read_bytes()), file)
     if level_id is None:
-        raise UserError(f"Which level of {source}? Add its id: `levelproof inspect {source}` lists them.")
+        raise UserError(f"Which level of {source}? Add its id, such as {require_manifest(source, []).level_ids[0]}.")
     manifest, row = find_level(source, level_id)
     level = jax.tree.map(np.asarray, levels_of(manifest, manifest.table))
     file = require_playable(LevelFile(level, rules_of(manifest)))

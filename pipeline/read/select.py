@@ -1,12 +1,14 @@
 """Selection of manifest rows by an SQL condition, evaluated by DuckDB."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import duckdb
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
+from jaxtyping import Bool
 
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.store.columns import COLUMNS, with_current_names
@@ -74,6 +76,12 @@ def require_selected(split: Path, columns: Sequence[str], where: str | None, cou
 def both(where: str | None, condition: str) -> str:
     """Return the condition that both `where`, which may be empty, and `condition` hold."""
     return f"({where}) AND {condition}" if where else condition
+
+
+def labelled(rows: pa.Table, labels: Collection[str]) -> Bool[np.ndarray, " row"]:
+    """Return which rows of a manifest have one of the labels; `rows` has the column `label`."""
+    names = pa.array(labels, pa.string())
+    return pc.is_in(rows["label"].cast(pa.string()), names).to_numpy().copy()  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def select_some(split: Path, table: pa.Table, where: str | None) -> pa.Table:

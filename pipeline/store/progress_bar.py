@@ -17,7 +17,7 @@ class ProgressBar:
 
     def __init__(self, what: str, total: int, console: Console | None) -> None:
         self._what, self._console, self._line_at = what, console, time.monotonic()
-        self._quiet = console is None or not console.is_terminal
+        self._quiet = console is None or not console.is_interactive
         columns = BarColumn(), TaskProgressColumn(), TextColumn("{task.description}"), TimeRemainingColumn()
         self._bar = Progress(*columns, console=console, transient=True, disable=self._quiet)
         self._task = self._bar.add_task("", total=max(total, 1))

@@ -12,6 +12,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -110,7 +111,8 @@ def _chosen(split: Path, where: str | None, most: int) -> tuple[Manifest, int]:
     ids = select(manifest.table, where).column("level_id").to_numpy()
     if not len(ids):
         raise UserError(f"No level of {split} matches {where}: choose others with --where.")
-    return require_manifest(split, level_ids=ids[spread(len(ids), most)]), len(ids)
+    chosen = require_manifest(split, level_ids=ids[spread(len(ids), most)])
+    return replace(chosen, table=cost.with_known_costs(chosen)), len(ids)
 
 
 def _contender(policy: Path, manifest: Manifest) -> Contender:

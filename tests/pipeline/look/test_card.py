@@ -71,6 +71,8 @@ def test_card_of_seed_files_names_what_is_there(tmp_path: Path, monkeypatch: pyt
             assert re.fullmatch(r"\w+", entry["split"])
             assert [*tmp_path.glob(entry["path"])], entry
     assert ".zarr" not in text
+    shown = pq.read_table(next((tmp_path / "preview").iterdir()))
+    assert shown["env_steps"].null_count == 4, "seeds leave costs out"
     steps = np.nansum(read_manifest(seeds).table["steps_to_goal"].to_numpy())
     assert f"| {steps:,.0f} |" in text, "repetitions are not counted"
     assert f" {seeds.stat().st_size / steps:.1f} |" in text
@@ -141,12 +143,13 @@ def test_card_counts_each_split_once_and_refuses_equal_subsets(dataset: Path, mo
     once = out.read_text()
     cards.card([split, dataset / "64k/../64k/s"], out, CardOptions())
     assert out.read_text() == once
-    shutil.copytree(split, dataset / "64k.s")
-    try:
-        with pytest.raises(UserError, match=r"Both 64k/s and 64k\.s would be the subset 64k-s: rename one of them"):
-            cards.card([split, dataset / "64k.s"], out, CardOptions())
-    finally:
-        shutil.rmtree(dataset / "64k.s")
+    for name, as_what in (("64k.s", "subset 64k-s"), ("64k_s", "preview 64k_s")):
+        shutil.copytree(split, dataset / name)
+        try:
+            with pytest.raises(UserError, match=rf"Both 64k/s and {re.escape(name)} would be the {as_what}: rename"):
+                cards.card([split, dataset / name], out, CardOptions())
+        finally:
+            shutil.rmtree(dataset / name)
     assert out.read_text() == once
 
 

@@ -1,5 +1,6 @@
 """Watching a run through its split, until it ends."""
 
+import io
 import json
 import time
 from collections.abc import Callable
@@ -50,6 +51,20 @@ def test_watch_prints_a_line_per_refresh_until_the_run_ends(
     assert [state["running"] for state in facts] == [True, True, False]
     assert [state["done"] for state in facts] == [4, 6, 8]
     assert (facts[0]["solved_share"], facts[0]["failed"], facts[0]["rate"]) == (0.75, ["0-1: of this one"], 12)
+
+
+def test_watch_prints_each_table_into_a_pipe_at_once(split: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, pipe = new_run(split), io.StringIO()
+    write_events(run, [state("progress")])
+
+    def end() -> None:
+        assert "4 of 8 committed" in pipe.getvalue()
+        write_events(run, [state("ended", done=8)])
+
+    with only_writer(split, print):
+        between_refreshes(monkeypatch, end)
+        watch(split, False, Console(file=pipe))
+    assert "8 of 8 committed" in pipe.getvalue()
 
 
 def test_watch_waits_for_a_run_that_has_logged_nothing_yet(

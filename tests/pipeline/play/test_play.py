@@ -212,6 +212,8 @@ def test_play_refuses_unplayable_arguments(split: Path, tmp_path: Path, address:
     with pytest.raises(UserError, match="leave out"):
         level_to_play(level, 1, None)
     assert level_to_play(level, None, None)[1] is None
+    with pytest.raises(UserError, match="There is no split at"):
+        level_to_play(tmp_path / "128k/x", None, None)
 
 
 def test_level_whose_steps_take_minutes_is_refused(page: ClientConnection, tmp_path: Path) -> None:

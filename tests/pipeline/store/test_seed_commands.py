@@ -21,6 +21,7 @@ from levelproof.pipeline.store.checksums import with_own
 from levelproof.pipeline.store.manifest import read_manifest, write_index
 from levelproof.pipeline.store.seed.columns import CONTENT_KEY, SCHEMA, WRITTEN
 from levelproof.pipeline.store.seed.packed import ENTRIES
+from levelproof.pipeline.store.seed.rows import COSTS
 from levelproof.pipeline.verify.verify import examine
 from tests.pipeline.command import assert_refused, here, run
 from tests.pipeline.made import honest_split
@@ -162,6 +163,15 @@ def test_gallery_show_and_export_of_a_seed_file_are_those_of_its_split(split: Pa
         theirs, ours, there = map(written, (str(split), str(seed), f"{server.url}/{seed.name}"))
     assert theirs[0].startswith(f"level.svg: level {level_id} of size s, solved in ")
     assert theirs == ours == there
+
+
+def test_costs_that_seeds_leave_out_are_not_shown_as_zero(seed: Path, tmp_path: Path) -> None:
+    done = here(["inspect", str(seed), "--columns", "level_id,env_steps", "--limit", "1"], tmp_path)
+    assert done.stdout.splitlines()[-1].split() == [str(read_manifest(seed, []).level_ids[0]), "-"]
+    assert here(["gallery", str(seed), "-o", "site"], tmp_path).returncode == 0
+    page = (tmp_path / "site/data/levels/0/0.js").read_text()
+    row = json.loads(page[page.index(",") + 1 : page.rindex(")")])["row"]
+    assert [row[name] for name in COSTS] == [None] * len(COSTS)
 
 
 def motion(page: str) -> Any:

@@ -1,0 +1,31 @@
+"""Tables are whole wherever they are printed."""
+
+import io
+
+import pytest
+from rich.console import Console
+from rich.table import Table
+
+from levelproof.pipeline.tables import console_for_tables, print_table
+
+PATH = "/data/experiments/" + "x" * 150 + "/128k/s"
+
+
+def table() -> Table:
+    table = Table("level_id", "file", box=None)
+    table.add_row("7", PATH)
+    return table
+
+
+def test_long_cell_is_whole_in_a_pipe(capsys: pytest.CaptureFixture[str]) -> None:
+    print_table(table(), console_for_tables())
+    header, row = capsys.readouterr().out.splitlines()
+    assert row.split() == ["7", PATH]
+    assert len(header) < 200
+
+
+def test_long_cell_continues_on_the_next_lines_of_a_terminal() -> None:
+    text = io.StringIO()
+    print_table(table(), Console(file=text, width=80, force_terminal=True, color_system=None))
+    _, first, *others = text.getvalue().splitlines()
+    assert "".join([first.split()[1], *(line.strip() for line in others)]) == PATH
