@@ -2,7 +2,7 @@
 
 import os
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
@@ -240,20 +240,17 @@ def compose_train(overrides: Sequence[str]) -> "TrainConfig":
     parsed = [_parse(text) for text in overrides]
     config = _changed(TrainConfig, parsed)
     config = replace(config, start=os.path.expanduser(config.start), levels=os.path.expanduser(config.levels))
-    names = [override.key_or_group for override in parsed]
-    random = config.levels in CURRICULA
-    useless = ("where", "choice", "starts") if random else ("size", "distribution")
-    for name in names:
-        if name.partition(".")[0] in useless:
-            kind = "random levels" if random else "the levels of a split or of files"
-            raise ConfigError(f"{name} has no effect on {kind} (levels={config.levels}): leave it out.")
-        if config.chosen_by not in READ_BY.get(name.partition(".")[0], [config.chosen_by]):
-            chosen = f"levels={config.levels}" if random else f"choice={config.choice}"
-            raise ConfigError(f"{name} has no effect with {chosen}: leave it out.")
-        if not config.start and name in ("ppo.critic_updates", "ppo.kl_weight", "ppo.kl_updates"):
-            raise ConfigError(f"{name} has no effect without start: leave it out.")
-        if name == "ppo.kl_updates" and not config.ppo.kl_weight:
-            raise ConfigError(f"{name} has no effect without ppo.kl_weight: leave it out.")
+    if random := config.levels in CURRICULA:
+        _require_effect(parsed, ("where", "choice", "starts"), f"on random levels (levels={config.levels})")
+    else:
+        why = f"on the levels of a split or of files (levels={config.levels})"
+        _require_effect(parsed, ("size", "distribution"), why)
+    unread = [group for group, readers in READ_BY.items() if config.chosen_by not in readers]
+    _require_effect(parsed, unread, f"with {f'levels={config.levels}' if random else f'choice={config.choice}'}")
+    if not config.start:
+        _require_effect(parsed, ("ppo.critic_updates", "ppo.kl_weight", "ppo.kl_updates"), "without start")
+    if not config.ppo.kl_weight:
+        _require_effect(parsed, ("ppo.kl_updates",), "without ppo.kl_weight")
     if config.start and config.ppo.critic_updates >= config.ppo.updates:
         raise ConfigError(
             f"ppo.env_steps gives {config.ppo.updates} updates, and the first {config.ppo.critic_updates} "
@@ -278,16 +275,21 @@ def compose_distill(overrides: Sequence[str]) -> "DistillConfig":
     parsed = [_parse(text) for text in overrides]
     config = _changed(DistillConfig, parsed)
     config = replace(config, start=os.path.expanduser(config.start))
-    noise = ("teachers.sticky", "teachers.perturbed")
-    asking = ("failed", *(f"teachers.{name}" for name in ("expert", "witness", "random", "learner")))
-    for setting in parsed:
-        if setting.key_or_group in noise and not config.demonstrations:
-            raise ConfigError(f"{setting.key_or_group} has no effect without demonstrations: leave it out.")
-        if setting.key_or_group in asking and not config.states:
-            raise ConfigError(f"{setting.key_or_group} has no effect with states=0: leave it out.")
+    if not config.demonstrations:
+        _require_effect(parsed, ("teachers.sticky", "teachers.perturbed"), "without demonstrations")
+    if not config.states:
+        asking = ("failed", *(f"teachers.{name}" for name in ("expert", "witness", "random", "learner")))
+        _require_effect(parsed, asking, "with states=0")
     _require_no_network(config.start, parsed)
     _require_heads(config.network.kind, parsed)
     return config
+
+
+def _require_effect(overrides: Iterable[Override], useless: Collection[str], why: str) -> None:
+    """Raise ConfigError if a setting, or its group, is among those that have no effect; `why` ends the sentence."""
+    for name in (override.key_or_group for override in overrides):
+        if name in useless or name.partition(".")[0] in useless:
+            raise ConfigError(f"{name} has no effect {why}: leave it out.")
 
 
 def _require_no_network(start: str, overrides: Iterable[Override]) -> None:
@@ -299,8 +301,8 @@ def _require_no_network(start: str, overrides: Iterable[Override]) -> None:
 
 def _require_heads(kind: str, overrides: Iterable[Override]) -> None:
     """Raise ConfigError if settings give heads to a network without attention."""
-    if kind not in ("attention", "transformer") and any(each.key_or_group == "network.heads" for each in overrides):
-        raise ConfigError(f"network.heads has no effect with network.kind={kind}: leave it out.")
+    if kind not in ("attention", "transformer"):
+        _require_effect(overrides, ("network.heads",), f"with network.kind={kind}")
 
 
 def _changed(cls: type[T], overrides: Iterable[Override]) -> T:

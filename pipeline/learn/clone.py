@@ -1,6 +1,5 @@
 """Behaviour cloning of one policy on splits, with checkpoints from which a run continues bit for bit."""
 
-import time
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -25,19 +24,16 @@ from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.learn.curves import BLUE, GREEN, Curves, Panel
 from levelproof.pipeline.learn.folder import (
     continued,
-    keep_run,
-    require_finite,
+    origin_of,
     require_same_run,
     settings_without,
     shown,
     tell_done,
-    with_stack,
-    write_note,
     writing_run,
 )
-from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.pace import Pace
 from levelproof.pipeline.learn.pool import Feed, PartedSplit, validation_batches
+from levelproof.pipeline.learn.run import Run, recorded
 from levelproof.pipeline.learn.sealed import require_not_sealed, without_sealed
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.progress_bar import ProgressBar
@@ -73,20 +69,19 @@ def clone(splits: Sequence[Path], config: CloneConfig, out: Path, console: Conso
     tell = lambda text: say(console, text)
     sources = [source_of(split, config, tell) for split in splits]
     size, note = size_for(sources, config), note_of(sources, config)
+
+    def policy_of(note: dict[str, Any], state: Imitation) -> Policy:
+        origin = origin_of(note, {"updates": int(state.updates)})
+        return Policy(config.network, state.average, config.network.only_size(size), origin)
+
     with writing_run(out) as require_ours:
         require_same_run(out, note)
         state = continued(out, begin_imitation(np.int32(config.seed), config.network, size, config.train))
-        write_note(out, note := with_stack(out, note, tell))
         curves = COURSE if config.played else COURSE._replace(panels=COURSE.panels[:-1])
-
-        def save(state: Imitation) -> None:
-            require_ours()
-            keep(out, state, config, size, note)
-
-        with Metrics(out, curves, config.log, note, int(state.updates), tell, require_ours) as metrics:
+        with recorded(out, note, curves, config.log, int(state.updates), policy_of, tell, require_ours) as run:
             if int(state.updates) < config.train.updates:
-                state = train(sources, config, save, state, metrics, console)
-        save(state)
+                state = train(sources, config, state, run, console)
+            run.save(state)
     tell_done(out, tell)
 
 
@@ -131,27 +126,20 @@ def note_of(sources: Sequence[PartedSplit], config: CloneConfig) -> dict[str, An
     return {"splits": splits, "settings": settings}
 
 
-def keep(out: Path, state: Imitation, config: CloneConfig, size: Size, note: dict[str, Any]) -> None:
-    """Write the checkpoint, then the policy."""
-    origin = note | {"updates": int(state.updates)}
-    keep_run(out, Policy(config.network, state.average, config.network.only_size(size), origin), state)
-
-
 def train(
     sources: Sequence[PartedSplit],
     config: CloneConfig,
-    save: Callable[[Imitation], None],
     state: Imitation,
-    metrics: Metrics,
+    run: Run[Imitation],
     console: Console,
 ) -> Imitation:
-    """Take the updates that are left; validate, and `save` the state, every `config.interval` of them.
+    """Take the updates that are left; validate, and keep the state, every `config.interval` of them.
 
     Raises:
         Failure: the weights have diverged.
     """
     last, first, recent = config.train.updates, int(state.updates), []
-    before, pace = metrics.last.get("bc/core_seconds", 0.0), Pace()
+    pace = Pace()
     feed, total = Feed(sources, config), sum(len(source.train) for source in sources)
     if feed.used < total:
         text = f"Only {feed.used:,} of {total:,} levels are used: raise pool or train.updates, or lower refresh."
@@ -173,11 +161,8 @@ def train(
                 with pace.aside():
                     numbers = {COURSE.step: update, "bc/samples_per_second": rate * config.train.batch or np.nan}
                     numbers |= averages("", recent) | validated(state, held, config)
-                    numbers["bc/core_seconds"] = before + time.process_time()
-                    require_finite(numbers["bc/loss"], "train.learning_rate")
                     recent = []
-                    metrics.write(numbers)  # before the checkpoint: a run that continues drops lines after it
-                    save(state)
+                    run.keep(state, numbers, "bc/loss", "train.learning_rate")
                 words = f"{line_of(update, last, numbers)}{speed}"
             show(1, words, keep)
     return state

@@ -5,7 +5,6 @@ decides how a run continues is in its checkpoint or follows from the settings an
 """
 
 import hashlib
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,26 +27,23 @@ from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.learn.curves import BLUE, GREEN, YELLOW, Curves, Panel
 from levelproof.pipeline.learn.folder import (
     continued,
-    keep_run,
     origin_of,
-    require_finite,
     require_same_run,
     settings_without,
     shown,
     tell_done,
     weights_digest,
-    with_stack,
-    write_note,
     writing_run,
 )
 from levelproof.pipeline.learn.kept_experts import experts_of
 from levelproof.pipeline.learn.labelled import LabelBuffer, empty_labels
-from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.pace import Pace
 from levelproof.pipeline.learn.pool import read_pool
 from levelproof.pipeline.learn.rounds import TaughtLevels, teach
+from levelproof.pipeline.learn.run import Run, recorded
 from levelproof.pipeline.learn.sealed import require_not_sealed, require_some_usable, without_sealed
 from levelproof.pipeline.read.policies import policy_at, require_size
+from levelproof.pipeline.read.select import labelled
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.progress_bar import ProgressBar
 from levelproof.pipeline.words import duration
@@ -97,6 +93,11 @@ def distill(split: Path, config: DistillConfig, out: Path, console: Console) -> 
     if start:
         require_size(start, size, str(split), "start from one that plays any size")
     note = note_of(chosen, config)
+
+    def policy_of(note: dict[str, Any], now: Distillation) -> Policy:
+        origin = origin_of(note, {"updates": int(now.imitation.updates)}, start)
+        return Policy(network, now.imitation.average, network.only_size(size), origin)
+
     with writing_run(out) as require_ours:
         require_same_run(out, note)
         taught = witnessed(chosen, network, console)
@@ -108,16 +109,10 @@ def distill(split: Path, config: DistillConfig, out: Path, console: Console) -> 
         )
         now = continued(out, fresh)
         now = now._replace(labels=jax.device_get(now.labels))
-        write_note(out, note := with_stack(out, note, tell))
-
-        def save(now: Distillation) -> None:
-            require_ours()
-            origin = origin_of(note, {"updates": int(now.imitation.updates)}, start)
-            keep_run(out, Policy(network, now.imitation.average, network.only_size(size), origin), now)
-
-        with Metrics(out, COURSE, config.log, note, int(now.imitation.updates), tell, require_ours) as metrics:
-            now = update_until_done(taught, config, network, now, save, metrics, console)
-        save(now)
+        updates = int(now.imitation.updates)
+        with recorded(out, note, COURSE, config.log, updates, policy_of, tell, require_ours) as run:
+            now = update_until_done(taught, config, network, now, run, console)
+            run.save(now)
     tell_done(out, tell)
 
 
@@ -133,7 +128,7 @@ def levels_for(split: Path, config: DistillConfig, tell: Callable[[str], None]) 
     require_not_sealed(split, ids, config.where)
     usable = without_sealed(split, data.content_hashes, tell)
     require_some_usable(split, usable)
-    trivial = np.array([label == Label.TRIVIAL for label in data.manifest["label"].to_pylist()])
+    trivial = labelled(data.manifest, [Label.TRIVIAL])
     if not (usable & ~trivial).any():
         raise UserError(f"All levels of {split} that meet the condition are trivial: choose others with where.")
     chosen = np.flatnonzero(usable & ~trivial)
@@ -195,18 +190,17 @@ def update_until_done(
     config: DistillConfig,
     network: NetworkConfig,
     now: Distillation,
-    save: Callable[[Distillation], None],
-    metrics: Metrics,
+    run: Run[Distillation],
     console: Console,
 ) -> Distillation:
-    """Take the rounds that are left; `save` the state and write metrics after each.
+    """Take the rounds that are left; keep the state and its metrics after each.
 
     Raises:
         UserError: no state has a label, and no witness is learned from.
         Failure: the weights have diverged.
     """
     last, first = config.train.updates, int(now.imitation.updates)
-    before, pace = metrics.last.get("distill/core_seconds", 0.0), Pace()
+    pace = Pace()
     with shown(console, "compiling", last, first) as show:
         for update in range(first, last, config.interval):
             show(0, f"{update:,}/{last:,} updates · asking teachers")
@@ -219,8 +213,6 @@ def update_until_done(
             until = min(update + config.interval, last)
             now, recent = learn(taught, config, network, now, until)
             numbers = {COURSE.step: until, **numbers, **likeness_of(recent)}
-            numbers["distill/core_seconds"] = before + time.process_time()
-            require_finite(numbers["distill/loss"], "train.learning_rate")
             by_teachers = (
                 f"{numbers['distill/labelled']:.1%} of states labelled"
                 if config.states
@@ -229,8 +221,7 @@ def update_until_done(
             words = f"{until:,}/{last:,} updates · {numbers['distill/solve_rate']:.1%} solved · {by_teachers}"
             if rate := pace.count(until - update):
                 words += f" · about {duration((last - until) / rate)} left"
-            metrics.write(numbers)  # before the checkpoint: a run that continues drops lines after it
-            save(now)
+            run.keep(now, numbers, "distill/loss", "train.learning_rate")
             show(until - update, words, keep=True)
     return now
 

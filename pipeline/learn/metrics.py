@@ -49,7 +49,7 @@ class Metrics:
             UserError: the logger's library is missing, or a link or the like has the name of a file.
         """
         require_library(log)
-        self._require_ours = require_ours
+        self.step, self._require_ours = curves.step, require_ours
         self._path, self._curves, self._log = folder / METRICS, curves, GuardedLog(log, say)
         lines = read_regular(self._path).decode().splitlines() if os.path.lexists(self._path) else []
         kept = [line for line in lines if line.endswith("}") and json.loads(line).get(curves.step, math.inf) <= steps]

@@ -1,7 +1,6 @@
 """Reinforcement learning of one policy over many levels, with checkpoints from which a run continues bit for bit."""
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,21 +26,17 @@ from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.learn.curves import BLUE, GREEN, Curves, Panel
 from levelproof.pipeline.learn.folder import (
     continued,
-    keep_run,
     note_in,
     origin_of,
-    require_finite,
     require_same_run,
     settings_without,
     shown,
     tell_done,
     weights_digest,
-    with_stack,
-    write_note,
     writing_run,
 )
-from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.pace import Pace
+from levelproof.pipeline.learn.run import Run, recorded
 from levelproof.pipeline.learn.trained_on import TrainingLevels, levels_for
 from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.runtime import own_cores, prepare_jax
@@ -81,6 +76,11 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
         tell(f"The policy learns from {share:.1%} of samples, not {config.ppo.subsample:.1%}, because {why}.")
     note = note_of(config, source, cores)
     params = None if start is None else start.params
+
+    def policy_of(note: dict[str, Any], learner: Learner) -> Policy:
+        origin = origin_of(note, {"env_steps": int(learner.updates) * config.ppo.steps_per_update}, start)
+        return Policy(recipe.network, learner.average, recipe.network.only_size(source.levels.size), origin)
+
     with writing_run(out) as require_ours:
         require_same_run(out, note, LATER)
         table = table_of(source.levels, recipe.rules)
@@ -90,19 +90,9 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
         steps = int(learner.updates) * config.ppo.steps_per_update
         if int(learner.updates) > config.ppo.updates:
             raise UserError(f"{out} has {steps:,} env steps of training already: set a larger ppo.env_steps.")
-        write_note(out, note := with_stack(out, note, tell))
-
-        def save(learner: Learner) -> None:
-            require_ours()
-            fits = recipe.network.only_size(source.levels.size)
-            origin = origin_of(note, {"env_steps": int(learner.updates) * config.ppo.steps_per_update}, start)
-            keep_run(out, Policy(recipe.network, learner.average, fits, origin), learner)
-
-        with Metrics(out, COURSE, config.log, note, steps, tell, require_ours) as metrics:
-            learner = update_until_done(
-                programs, learner, table, params, recipe, config.interval, save, metrics, console
-            )
-        save(learner)
+        with recorded(out, note, COURSE, config.log, steps, policy_of, tell, require_ours) as run:
+            learner = update_until_done(programs, learner, table, params, recipe, config.interval, run, console)
+            run.save(learner)
     tell_done(out, tell)
 
 
@@ -110,13 +100,16 @@ def prepared_cores(config: TrainConfig, note: dict[str, Any] | None) -> int:
     """Set JAX up, and return how many devices share the lanes: as many as before if the run continues.
 
     Raises:
-        UserError: JAX has fewer devices than that.
+        UserError: JAX has fewer devices than that, or uses a GPU.
     """
     noted = (note or {}).get("cores", 0)
     wanted = noted if noted and config.ppo.divides_evenly(noted) else config.cores  # else it is another run's folder
     even = next((cores for cores in range(len(own_cores()), 1, -1) if config.ppo.divides_evenly(cores)), 1)
     prepare_jax(devices=wanted or even)
     if jax.default_backend() != "cpu":
+        if wanted > 1:
+            whose = "the run so far used" if noted else "the command asks for"
+            raise UserError(f"{whose.capitalize()} {wanted} cores, but JAX uses a GPU here: set JAX_PLATFORMS=cpu.")
         return 1
     there = len(jax.devices())
     if wanted > there:
@@ -175,17 +168,16 @@ def update_until_done(
     start: Any,
     recipe: TrainingRecipe,
     interval: int,
-    save: Callable[[Learner], None],
-    metrics: Metrics,
+    run: Run[Learner],
     console: Console,
 ) -> Learner:
-    """Take the updates that are left; `save` the learner and write metrics every `interval` of them.
+    """Take the updates that are left; keep the learner and its metrics every `interval` of them.
 
     Raises:
         Failure: the weights have diverged.
     """
     last, first, per_update = recipe.ppo.updates, int(learner.updates), recipe.ppo.steps_per_update
-    before, pace, recent = metrics.last.get("train/core_seconds", 0.0), Pace(), []
+    pace, recent = Pace(), []
     every = recipe.curriculum.every
     with shown(console, "compiling", last, first) as show:
         for update in range(first + 1, last + 1):
@@ -205,11 +197,8 @@ def update_until_done(
                     numbers = {COURSE.step: update * per_update, "train/updates": update} | averages(recent)
                     numbers |= recipe.curriculum.facts(learner.curriculum)
                     numbers["train/env_steps_per_second"] = rate or np.nan  # unknown
-                    numbers["train/core_seconds"] = before + time.process_time()
-                    require_finite(numbers["loss/value"], "ppo.learning_rate")
                     recent = []
-                    metrics.write(numbers)  # before the checkpoint: a run that continues drops lines after it
-                    save(learner)
+                    run.keep(learner, numbers, "loss/value", "ppo.learning_rate")
             show(1, words, keep)
     return learner
 

@@ -4,7 +4,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import is_dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from levelproof.configs.compose import override_of
 from levelproof.configs.convert import plain
 from levelproof.configs.meanings import comments_in
 from levelproof.experts.networks.saved import WEIGHTS
+from levelproof.pipeline.learn import run
 from tests.pipeline.command import ROOT
 
 
@@ -30,15 +30,15 @@ def assert_average_is_kept(out: Path, average: str, last: str) -> None:
     assert any((values != kept[last + name]).any() for name, values in weights.items())
 
 
-def stop_after_saving(monkeypatch: pytest.MonkeyPatch, command: ModuleType) -> None:
-    """Let the learner of this module be stopped, as by Ctrl-C, once it has saved a checkpoint."""
-    keep = command.keep_run
+def stop_after_saving(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a learner be stopped, as by Ctrl-C, once it has saved a checkpoint."""
+    keep = run.keep_run
 
     def stopped(*arguments: Any) -> None:
         keep(*arguments)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(command, "keep_run", stopped)
+    monkeypatch.setattr(run, "keep_run", stopped)
 
 
 def assert_guide_lists(settings: Mapping[str, Any], *pages: str) -> None:

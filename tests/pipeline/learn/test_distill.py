@@ -32,7 +32,7 @@ from tests.pipeline.learn.runs import assert_average_is_kept, assert_guide_lists
 from tests.pipeline.made import honest_split, made_job
 
 TINY = ("network.width=8", "network.depth=1", "network.heads=1")
-ROUNDS = ("train.updates=6", "interval=2", "train.batch=32", "episodes=8", "states=16", "buffer=64")
+ROUNDS = ("train.updates=6", "interval=2", "train.batch=32", "episodes=8", "states=16", "buffer=256")
 TEACHERS = ("teachers.witness=2", "teachers.random=8", "teachers.learner=1")
 
 
@@ -71,7 +71,7 @@ def test_kept_experts_of_a_split_label_states_and_demonstrate(tmp_path: Path, mo
     out.rename(tmp_path / "both")
     split, alone = tmp_path / "data/5k/s", ("states=0", *TINY, *shown)
     with monkeypatch.context() as patch:
-        stop_after_saving(patch, module)
+        stop_after_saving(patch)
         assert here(["distill", str(split), "-o", "policy", *ROUNDS, *alone], tmp_path).returncode == 130
     assert load_file(tmp_path / "policy/checkpoint.safetensors")[".imitation.updates"] == 2
     out = distilled(tmp_path, split, *alone, teachers=())
@@ -288,6 +288,7 @@ def test_trivial_levels_are_left_out(tmp_path: Path) -> None:
             "network.width cannot change the network",
         ),
         (["SPLIT", "witnesses=1"], "witnesses is 1"),
+        (["SPLIT", "buffer=4095"], "at least (states + demonstrations) x path = 4096"),
         (["SPLIT", "states=0"], "states and demonstrations are both 0"),
         (["SPLIT", "demonstrations=4"], "no kept experts of these levels, and demonstrations need them"),
         (["SPLIT", "teachers.perturbed=1"], "teachers.perturbed has no effect without demonstrations"),

@@ -21,7 +21,7 @@ RUNS = {
         "ppo.horizon=32", f"ppo.env_steps={10 * 64 * 32}", "ppo.repeat=1",
     ),
     "distill": (
-        "SPLIT", "interval=2", "train.updates=20", "train.batch=32", "episodes=8", "states=16", "buffer=64",
+        "SPLIT", "interval=2", "train.updates=20", "train.batch=32", "episodes=8", "states=16", "buffer=256",
         "teachers.witness=2", "teachers.random=8", "teachers.learner=1",
     ),
 }  # fmt: skip

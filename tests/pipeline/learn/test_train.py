@@ -18,6 +18,7 @@ from levelproof.experts.generalist.train import _programs as programs
 from levelproof.experts.networks.saved import Policy, policy_folder
 from levelproof.levelgen.task.lanes import FIRST_EXTRA
 from levelproof.pipeline.exchange.level_json import export
+from levelproof.pipeline.learn import run as writer
 from levelproof.pipeline.learn import sealed
 from levelproof.pipeline.learn import train as module
 from levelproof.pipeline.learn.metrics import Metrics
@@ -146,7 +147,7 @@ def continues_bit_for_bit(words: tuple[str, ...], tmp_path: Path, monkeypatch: p
     words = ("interval=2", *words)
     whole = trained(tmp_path / "whole", 4, *words)
     made = programs.cache_info().misses
-    stop_after_saving(monkeypatch, module)
+    stop_after_saving(monkeypatch)
     (tmp_path / "stopped").mkdir()
     words_of_four = ["train", "-o", "agent", f"ppo.env_steps={4 * PER_UPDATE}", *LANES, *words]
     assert here(words_of_four, tmp_path / "stopped").returncode == 130
@@ -164,7 +165,7 @@ def continues_bit_for_bit(words: tuple[str, ...], tmp_path: Path, monkeypatch: p
 def test_run_killed_before_its_checkpoint_repeats_the_line_of_its_metrics(
     easy: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    keep, kept = module.keep_run, list[Any]()
+    keep, kept = writer.keep_run, list[Any]()
 
     def killed(out: Path, policy: Policy, learner: Any) -> None:
         kept.append(learner)
@@ -172,7 +173,7 @@ def test_run_killed_before_its_checkpoint_repeats_the_line_of_its_metrics(
             raise KeyboardInterrupt
         keep(out, policy, learner)
 
-    monkeypatch.setattr(module, "keep_run", killed)
+    monkeypatch.setattr(writer, "keep_run", killed)
     words = ["train", "-o", "agent", f"ppo.env_steps={3 * PER_UPDATE}", "interval=1", *LANES, *easy]
     assert here(words, tmp_path).returncode == 130
     stopped = metrics(tmp_path / "agent")
@@ -188,13 +189,13 @@ def test_start_keeps_its_weights_while_the_critic_fits(
     agent: Path, split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kept: list[dict[str, np.ndarray]] = []  # after each update
-    keep = module.keep_run
+    keep = writer.keep_run
 
     def noted(out: Path, *arguments: Any) -> None:
         keep(out, *arguments)
         kept.append(load_file(out / "policy.safetensors"))
 
-    monkeypatch.setattr(module, "keep_run", noted)
+    monkeypatch.setattr(writer, "keep_run", noted)
     words = (f"levels={split}", f"start={agent}", "ppo.critic_updates=2", "ppo.kl_weight=0.2")
     words = (*words, "ppo.kl_updates=2", "interval=1")
     curve = metrics(trained(tmp_path, 5, *words))
