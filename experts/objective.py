@@ -34,8 +34,8 @@ def advantages(
 ) -> Float[Array, "time ..."]:
     """Estimate generalised advantages (Schulman et al. 2016, arXiv:1506.02438).
 
-    The value after an episode's end is 0. To bootstrap at a time limit, add the discounted value of the state
-    reached to the reward.
+    The value after an episode's end is 0, also at a time limit: a policy for all levels then learns nothing from the
+    last action, and the caller puts the value of the last state in place of its reward. Experts do not bootstrap there.
     """
 
     def back(carry, now):

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -93,6 +94,23 @@ def _expanded(level: Level) -> Level:
     lanes = len(level)
     expand = lambda x: np.broadcast_to(x, (*x.shape[:-1], lanes))  # in numpy: JAX would compile each shape
     return jax.tree.map(lambda x: expand(np.asarray(x)), level)
+
+
+def on_device(levels: Level) -> Level:
+    """Return levels as JAX arrays, each with as many lanes as there are levels.
+
+    Raises:
+        ValueError: there are no levels, or the level axis is missing or not the last one.
+    """
+    count = len(levels) if np.ndim(levels.role) == 2 else 0
+    if count and not {x.shape[-1] for x in jax.tree.leaves(levels)} <= {1, count}:
+        count = 0
+    if not count:
+        raise ValueError(
+            f"levels.role has shape {np.shape(levels.role)}, but must have (bodies, levels): give at least one level, "
+            "level axis last, as sample_levels and Sampler.lanes do"
+        )
+    return jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x), (*x.shape[:-1], count)), levels)
 
 
 def size_of(name: str | Size) -> Size:

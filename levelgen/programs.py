@@ -263,4 +263,5 @@ def _machine() -> str:
 
 @cache
 def _processor() -> str:
-    return f"{version('jaxlib')} {binding.get_host_cpu_name()} {binding.get_host_cpu_features().flatten()}"
+    libraries = [version(name) for name in ("jaxlib", "flax", "optax")]  # besides those of `key_by_sources`
+    return f"{libraries} {binding.get_host_cpu_name()} {binding.get_host_cpu_features().flatten()}"

@@ -35,6 +35,7 @@ XLA_FLAGS = (
 XLA_THREADS = "NPROC", "PJRT_NPROC"  # size of XLA's pool
 NUMPY_THREADS = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 NO_GPU = "JAX finds no usable GPU (check that levelproof's extra `gpu` is installed)"
+UNFINISHED = 3600.0  # s after which a file that a process began to write is a killed one's
 LAST_CHECK = "looked"  # file beside the programs, touched when a check begins; programs older than it were readable
 CLAIM_SECONDS = 2.0  # s for which a worker tries to claim a core
 CLAIMS: list[socket.socket] = []  # sockets that mark this process's core as taken
@@ -125,6 +126,9 @@ def remove_damaged(folder: Path) -> None:
     with suppress(OSError):  # the folder is not writable: JAX itself warns of damaged programs
         new.touch()
         since = last.stat().st_mtime_ns if last.exists() else 0
+        for path in folder.glob(".levelproof-*"):  # what `physics.codegen.kept` was writing in a killed process
+            if time.time() - path.stat().st_mtime > UNFINISHED:
+                path.unlink(missing_ok=True)
         for path in folder.glob("*-cache"):
             try:
                 if path.stat().st_ctime_ns >= since:  # ns; ctime, because a copy may keep its original's mtime

@@ -39,7 +39,8 @@ class PPOConfig:
     kl_updates: int = 60  # updates after critic_updates over which kl_weight falls to 0
 
     def __post_init__(self) -> None:
-        require(self, ("env_steps", "environments", "horizon", "epochs", "minibatches"), 1)
+        require(self, ("env_steps", "environments", "epochs", "minibatches"), 1)
+        require(self, ("horizon",), 2)  # the last action of a rollout is not learned from
         require(self, ("repeat",), 1, MAX_REPEAT)
         require(self, ("learning_rate", "adam_epsilon", "max_gradient_norm"), 0, above=True)
         require(self, ("subsample",), 0, 1, above=True)

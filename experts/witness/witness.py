@@ -14,8 +14,9 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from levelproof.experts.config import RECORD_STEPS
 from levelproof.levelgen.batching import by_blocks, take
-from levelproof.levelgen.level import Level
+from levelproof.levelgen.level import ACTIONS, Level
 from levelproof.levelgen.programs import jit_sooner
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import controls
@@ -43,7 +44,7 @@ class Record:
 
 
 def replay(level: Level, action: ArrayLike, rules: TaskParams = DEFAULT_RULES) -> Record:
-    """Play 256 env steps with these actions; return numpy arrays.
+    """Play RECORD_STEPS (256) env steps with these actions; return numpy arrays.
 
     On one machine and set of versions, the bits are the same for any number of levels.
 
@@ -53,14 +54,14 @@ def replay(level: Level, action: ArrayLike, rules: TaskParams = DEFAULT_RULES) -
         rules: the task's rules.
 
     Raises:
-        ValueError: there are no levels, or not as many as actions.
+        ValueError: there are no levels, or the actions have another shape.
     """
-    level = jax.tree.map(np.asarray, level)
-    actions = np.asarray(action, np.int32)
-    count = actions.shape[-1]
-    if not 0 < count == len(level):
+    level, actions = level[:], np.asarray(action, np.int32)
+    count = len(level)
+    if not count or actions.shape != (RECORD_STEPS, ACTIONS, count):
         raise ValueError(
-            f"there are {len(level)} levels and actions for {count}: pass at least one level, and actions for each"
+            f"there are {count} levels and actions of shape {actions.shape}: pass at least one level, and actions of "
+            f"shape ({RECORD_STEPS}, {ACTIONS}, levels)"
         )
     record = by_blocks(lambda lanes: replay_block(take(level, lanes), actions[..., lanes], rules), count)
     return jax.tree.map(np.ascontiguousarray, record)

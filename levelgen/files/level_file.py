@@ -143,6 +143,8 @@ def to_document(file: LevelFile) -> dict[str, Any]:
         raise LevelFileError("the level starts with contacts, which a file cannot hold")
     if np.any(np.asarray(level.motor_auto) & np.asarray(level.model.joint_active)):
         raise LevelFileError("the level has a motor that runs by itself, which a file cannot express")
+    if np.any(np.asarray(level.model.collides) != np.asarray(collision_matrix(level.model))):
+        raise LevelFileError("its bodies collide otherwise than its joints imply, which a file cannot express")
     fields, counts = _with_points(level), dict(zip(layout.COUNTS, size, strict=True))
     physics = {theirs: getattr(rules.physics, ours) for ours, theirs in layout.PHYSICS.items()}
     document = {

@@ -49,11 +49,10 @@ def sample_levels(level_ids: ArrayLike, size: Size | str, distribution: Distribu
 
     Raises:
         ValueError: the size's name is unknown, or it has no room for the scenery, a green and a blue body; the ids are
-            not a list of integers, or one is not 0 .. MAX_LEVEL_ID; or `jax_enable_x64` is on.
+            not a list of integers, or one is not 0 .. MAX_LEVEL_ID; the distribution is a name; or `jax_enable_x64` is
+            on.
     """
-    require_32_bits()
-    size = size_of(size)
-    check_size(size)
+    size = _checked(size, distribution)
     ids = level_id_array(level_ids)
     padded = np.resize(ids, (max(1, -(-len(ids) // CHUNK)), CHUNK))
     chunks = [sample_chunk(chunk, size, distribution) for chunk in padded]
@@ -80,10 +79,19 @@ def sampler(size: Size | str, distribution: Distribution = DEFAULT) -> "Sampler"
     Raises:
         ValueError: as in `sample_levels`, except for ids.
     """
+    return Sampler(_checked(size, distribution), distribution)
+
+
+def _checked(size: Size | str, distribution: Distribution) -> Size:
+    """Return the size. Raise ValueError as `sample_levels`, except for ids."""
     require_32_bits()
+    if not isinstance(distribution, Distribution):
+        raise ValueError(
+            f"distribution is {distribution!r}, but must be a Distribution; levelproof.make takes names of presets"
+        )
     size = size_of(size)
     check_size(size)
-    return Sampler(size, distribution)
+    return size
 
 
 @jax.tree_util.register_static

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from levelproof.levelgen.level import MOTOR_BINDINGS, THRUSTER_BINDINGS, Level
+from levelproof.levelgen.level import ACTIONS, MOTOR_BINDINGS, THRUSTER_BINDINGS, Level
 
 MOTOR_CHOICES = 3
 THRUSTER_CHOICES = 2
@@ -26,7 +26,11 @@ def controls(level: Level, action: Int[Array, "6 lane"]) -> Controls:
     """Convert a multi-discrete action to controls: -1, 0 or 1 for motors, 0 or 1 for thrusters.
 
     A joint with `motor_auto` runs forward whatever the action says.
+
+    Raises:
+        ValueError: the action has another shape.
     """
+    _require_axes(action, ACTIONS)
     forward, backward = action[:MOTOR_BINDINGS] == 1, action[:MOTOR_BINDINGS] >= 2
     motor = forward.astype(jnp.float32) - backward.astype(jnp.float32)
     return _obeyed(level, motor, (action[MOTOR_BINDINGS:] != 0).astype(jnp.float32))
@@ -36,16 +40,29 @@ def discrete_controls(level: Level, action: Int[Array, " lane"]) -> Controls:
     """Convert a discrete action, a code below DISCRETE_ACTIONS, to controls.
 
     Codes 2k and 2k + 1 run the motors of entry k backward and forward, NOTHING does nothing, and NOTHING + 1 + k fires
-    the thrusters of entry k.
+    the thrusters of entry k. Raises ValueError if the action has another shape.
     """
+    _require_axes(action)
     is_code = lambda code: (action == code).astype(jnp.float32)
     motor = jnp.stack([is_code(2 * k + 1) - is_code(2 * k) for k in range(MOTOR_BINDINGS)])
     return _obeyed(level, motor, jnp.stack([is_code(NOTHING + 1 + k) for k in range(THRUSTER_BINDINGS)]))
 
 
 def continuous_controls(level: Level, action: Float[Array, "6 lane"]) -> Controls:
-    """Convert a continuous action to controls: clip to [-1, 1] for motors, to [0, 1] for thrusters."""
+    """Convert a continuous action to controls: clip to [-1, 1] for motors, to [0, 1] for thrusters.
+
+    Raises:
+        ValueError: the action has another shape.
+    """
+    _require_axes(action, ACTIONS)
     return _obeyed(level, jnp.clip(action[:MOTOR_BINDINGS], -1.0, 1.0), jnp.clip(action[MOTOR_BINDINGS:], 0.0, 1.0))
+
+
+def _require_axes(action: Array, *entries: int) -> None:
+    """Raise ValueError if an action does not have these axes before its lanes: others would broadcast silently."""
+    if action.shape[:-1] != entries or not action.ndim:
+        wanted = ", ".join([*map(str, entries), "lanes"])
+        raise ValueError(f"actions have shape {action.shape}, but must have ({wanted}) for this action_type")
 
 
 def _obeyed(level: Level, motor: Float[Array, "4 lane"], thrust: Float[Array, "2 lane"]) -> Controls:

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from levelproof.levelgen.level import ACTIONS, Level
+from levelproof.levelgen.level import ACTIONS, Level, on_device
 from levelproof.levelgen.sampling.sampler import Sampler
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import (
@@ -133,16 +133,19 @@ def make(
         final_observation: whether to add `info["final_observation"]`, the observation before an automatic reset.
 
     Raises:
-        ValueError: a type is unknown, there is no level, or `jax_enable_x64` is on.
+        ValueError: a type is unknown, there is no level, its axes are not those of levels, or `jax_enable_x64` is on.
     """
     require_32_bits()
     for kinds, name in (ActionType, action_type), (ObservationType, observation_type):
         if name not in [*kinds]:
             raise ValueError(f"there is no {kinds.__name__} {name!r}: choose one of {', '.join(kinds)}")
     if isinstance(levels, Level):
-        if not (count := len(levels)):
-            raise ValueError("there are no levels to reset to: give at least one")
-        levels = jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x), (*x.shape[:-1], count)), levels)
+        levels = on_device(levels)
+    elif not isinstance(levels, Sampler):
+        raise ValueError(
+            f"levels are of type {type(levels).__name__}: give a Level or a Sampler; of a level file, give file.level, "
+            "and rules=file.rules"
+        )
     env = Environment(
         levels, ActionType(action_type), ObservationType(observation_type), rules, auto_reset, final_observation
     )
@@ -152,9 +155,9 @@ def make(
 def starts(levels: Level) -> EnvState:
     """Return the first state of every level, level axis FIRST, for `vmap` and `override_reset_state`.
 
-    Each state's `level_index` is its level's index in `levels`.
+    Each state's `level_index` is its level's index in `levels`. Raises ValueError as `make`.
     """
-    states = EnvState.start(levels, jnp.arange(levels.state.rotation.shape[-1], dtype=jnp.int32))
+    states = EnvState.start(on_device(levels), jnp.arange(len(levels), dtype=jnp.int32))
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), states)
 
 
@@ -272,7 +275,7 @@ class Environment:
         levels = (params or self.default_params).levels
         if isinstance(levels, Sampler):
             return levels, levels.draw_id(_level_key(key, episode)), None
-        return levels, _draw_level(key, episode, levels.state.rotation.shape[-1]), None
+        return on_device(levels), _draw_level(key, episode, len(levels)), None
 
     def _reset_lanes(
         self, levels: Any, row: Int[Array, " lane"], inputs: tuple[EnvState | None, Array]

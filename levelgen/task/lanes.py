@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from levelproof.levelgen.level import Level
+from levelproof.levelgen.level import Level, on_device
 from levelproof.levelgen.sampling.sampler import FRESH_IDS, Sampler
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.environment import CONTROLS, Environment, EnvParams, info_of
@@ -73,14 +73,20 @@ class Lanes:
 
     `table` is computed once from parameters. `reset` starts episodes and returns `played`: each lane's own columns of
     the table, which every `step` takes and returns. `take` returns these columns for any level indices.
+
+    Do not map `reset` and `step` with `jax.vmap`: give them more lanes instead. `Environment` can be mapped.
     """
 
     env: Environment
 
     def table(self, params: EnvParams | None = None) -> Table:
-        """Build the table of the levels of `params`; a Sampler is its own table, indexed by level id."""
+        """Build the table of the levels of `params`; a Sampler is its own table, indexed by level id.
+
+        Raises:
+            ValueError: there are no levels, or the level axis is not the last one.
+        """
         levels = (params or self.env.default_params).levels
-        return levels if isinstance(levels, Sampler) else self._table(levels)
+        return levels if isinstance(levels, Sampler) else self._table(on_device(levels))
 
     def _table(self, level: Level) -> LevelTable:
         features = constant_features(self.env.observation_type, level)

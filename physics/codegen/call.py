@@ -52,8 +52,9 @@ class Kernel:
         def kernel(*arrays):
             self.body(*jax.tree.map(jax.new_ref, arrays))
 
-        # Under `jax.shard_map`, JAX would add equations that move arrays between the mesh's devices
-        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+        # Under `jax.shard_map`, JAX would add equations that move arrays between the mesh's devices. Under
+        # `jax.disable_jit`, loops would be unrolled, and the long code be kept for other processes.
+        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())), jax.disable_jit(False):
             return jax.make_jaxpr(kernel)(*jax.tree.map(Buffer.array, self.buffers))
 
     def compiled(self, request: str, sources: Sequence[Path]) -> "Compiled":

@@ -94,5 +94,5 @@ def _sources(folder: Path) -> tuple[str, float]:
     digest, changed = hashlib.sha256(), 0.0
     for path in sorted(folder.rglob("*.py")):
         digest.update(f"{path.relative_to(folder)} {path.stat().st_size}\n".encode() + path.read_bytes())
-        changed = max(changed, path.stat().st_mtime)
+        changed = max(changed, path.stat().st_mtime, path.stat().st_ctime)  # a copy may keep its original's mtime
     return digest.hexdigest(), changed

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from levelproof.configs.schema import distribution_in, from_files, rules_in
 from levelproof.levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
 from levelproof.levelgen.identity.keys import ALIKE_VERSIONS, MAX_LEVEL_ID, SAMPLER_VERSION
 from levelproof.levelgen.level import Level, concatenate_levels, size_of
-from levelproof.levelgen.sampling.sampler import Distribution, sample_levels
+from levelproof.levelgen.sampling.sampler import Distribution, on_cpu, sample_levels
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.read.level_files import levels_at
@@ -27,7 +27,7 @@ from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.store.seed.shard import stored_levels
 from levelproof.pipeline.words import many
 
-COLUMNS = ("label", "label_reason", *ASKED)  # read for a level that is drawn or exported
+COLUMNS = ("label", "label_reason", "device", *ASKED)  # read for a level that is drawn or exported
 
 
 def find_level(split: Path, level_id: int) -> tuple[Manifest, dict[str, Any]]:
@@ -74,7 +74,9 @@ def levels_of(manifest: Manifest, rows: pa.Table, in_command: bool = True) -> Le
         elif distribution is None:
             parts.append(levels_at([origin_of(manifest.split, row) for row in others.to_pylist()]))
         else:
-            parts.append(sample_levels(others.column("level_id").to_numpy(), size, distribution))
+            devices = others["device"].unique().to_pylist() if "device" in others.column_names else []
+            with on_cpu() if all(device.startswith("cpu") for device in devices) else nullcontext():
+                parts.append(sample_levels(others["level_id"].to_numpy(), size, distribution))
     order = np.argsort(np.concatenate([np.flatnonzero(stored), np.flatnonzero(~stored)]))
     return concatenate_levels(parts)[order]
 

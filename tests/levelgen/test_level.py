@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from levelproof.levelgen.level import MAX_PER_KIND, SIZES, Level, concatenate_levels, name_of, size_of
-from levelproof.levelgen.sampling.sampler import sample_levels
+from levelproof.levelgen.sampling.sampler import sample_levels, sampler
 from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.physics.types import Size
 
@@ -90,3 +90,9 @@ def test_functions_accept_a_size_by_its_name() -> None:
     assert_same(sample_levels([0], "s"), sample_levels([0], SIZES["s"]))
     with pytest.raises(ValueError, match="size is 'xl': choose one of s, m, l"):
         sample_levels([0], "xl")
+
+
+def test_sampling_refuses_the_name_of_a_distribution() -> None:
+    for refuses in (lambda: sample_levels([0], "s", "clutter"), lambda: sampler("s", "clutter")):  # pyright: ignore[reportArgumentType]
+        with pytest.raises(ValueError, match="distribution is 'clutter', but must be a Distribution"):
+            refuses()

@@ -40,6 +40,17 @@ def test_truncated_program_is_recompiled_without_a_warning(tmp_path: Path) -> No
     assert programs(folder) == again
 
 
+def test_remove_damaged_deletes_what_killed_processes_were_writing(tmp_path: Path) -> None:
+    names = ".levelproof-1.kernel.7.8", ".levelproof-2.kernel.7.8", "levelproof-3.kernel"
+    old, new, whole = (tmp_path / name for name in names)
+    for path in old, new, whole:
+        path.write_bytes(b"")
+    for path in old, whole:
+        os.utime(path, (0, 0))
+    remove_damaged(tmp_path)
+    assert (old.exists(), new.exists(), whole.exists()) == (False, True, True)
+
+
 def test_remove_damaged_reads_programs_that_changed_since_the_last_check(tmp_path: Path) -> None:
     program, last_check = tmp_path / "jit_f-0-cache", tmp_path / LAST_CHECK
     program.write_bytes(b"damaged")

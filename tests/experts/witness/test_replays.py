@@ -1,6 +1,7 @@
 """A witness solves its level on every processor: replaying it gives the same record, bit for bit."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -31,5 +32,17 @@ def test_witnesses_give_the_same_records_on_other_processors(processor: str) -> 
 
 @pytest.mark.parametrize("count", [0, 3])
 def test_replay_refuses_no_levels_and_actions_of_others(count: int) -> None:
-    with pytest.raises(ValueError, match=f"{count} levels and actions for 0"):
+    with pytest.raises(ValueError, match=rf"{count} levels and actions of shape \(256, 6, 0\)"):
         replay(sample_levels(np.arange(4), "s")[:count], np.zeros((RECORD_STEPS, ACTIONS, 0), int))
+
+
+@pytest.mark.parametrize("shape", [(RECORD_STEPS, 4), (100, ACTIONS, 4), (RECORD_STEPS, 4, ACTIONS)])
+def test_replay_refuses_actions_of_another_shape(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match=r"pass at least one level, and actions of shape \(256, 6, levels\)"):
+        replay(sample_levels(np.arange(4), "s"), np.zeros(shape, int))
+
+
+def test_replay_takes_arrays_that_all_levels_share() -> None:
+    levels, actions = sample_levels(np.arange(4), "s"), np.ones((RECORD_STEPS, ACTIONS, 4), int)
+    shared = replace(levels, model=replace(levels.model, gravity=np.array([[0.0], [-1.6]], np.float32)))
+    assert (replay(shared, actions).state.position != replay(levels, actions).state.position).any()

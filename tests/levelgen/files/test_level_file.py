@@ -134,8 +134,12 @@ def test_writer_refuses_levels_that_a_file_cannot_hold() -> None:
     broken = dataclasses.replace(
         level, state=dataclasses.replace(level.state, position=np.full_like(level.state.position, np.nan))
     )
+    apart = dataclasses.replace(
+        level, model=dataclasses.replace(level.model, collides=np.zeros_like(level.model.collides))
+    )
     for altered, words in (
         (levels(SIZES["s"]), "8 levels"),
+        (apart, "bodies collide otherwise than its joints imply"),
         (own_will, "runs by itself"),
         (touching, "starts with contacts"),
         (broken, r"polygon\[0\]\.position\.0 is NaN"),

@@ -1,10 +1,13 @@
 """The environment for users of gymnax: single, mapped, mapped twice or around loops, always the same world."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from levelproof.levelgen.files.level_file import LevelFile
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task import rules as task
@@ -293,8 +296,26 @@ def test_step_refuses_an_action_of_another_type(levels: Level) -> None:
 
 
 def test_make_refuses_no_levels(levels: Level) -> None:
-    with pytest.raises(ValueError, match="there are no levels to reset to"):
+    with pytest.raises(ValueError, match="give at least one level, level axis last"):
         make(jax.tree.map(lambda x: x[..., :0], levels))
+
+
+def test_levels_of_other_axes_and_types_are_refused(levels: Level) -> None:
+    one, first = jax.tree.map(lambda x: x[..., 0], levels), jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), levels)
+    for wrong in one, first:
+        for takes in make, starts:
+            with pytest.raises(ValueError, match=r"levels.role has shape .*, but must have \(bodies, levels\)"):
+                takes(wrong)
+    with pytest.raises(ValueError, match=r"of a level file, give file\.level, and rules=file\.rules"):
+        make(LevelFile(levels, task.DEFAULT_RULES))  # pyright: ignore[reportArgumentType]
+
+
+def test_levels_that_share_an_array_are_drawn_and_started_like_others(levels: Level) -> None:
+    env, params = make(levels)
+    shared = replace(levels, state=replace(levels.state, rotation=levels.state.rotation[:, :1]))
+    _, states = jax.vmap(env.reset, (0, None))(jax.random.split(jax.random.key(0), 64), replace(params, levels=shared))
+    assert len(set(np.asarray(states.level_index).tolist())) > 1
+    assert starts(shared).level_index.shape == (len(levels),)
 
 
 def test_environment_refuses_64_bit_mode(levels: Level) -> None:

@@ -1,5 +1,7 @@
 """Lanes against mapped single environments: the same worlds, rewards, ends and observations."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,6 +52,21 @@ def test_lanes_step_as_mapped_environments_do(levels: Level) -> None:
         ended += int(done.sum())
     assert ended > 2 * COUNT
     jax.tree.map(np.testing.assert_array_equal, played, jax.jit(lanes.take)(table, state.level_index))
+
+
+def test_lanes_take_numpy_levels_and_refuse_actions_of_another_type(levels: Level) -> None:
+    env, params = make(levels)
+    lanes = Lanes(env)
+    table = lanes.table(replace(params, levels=levels[:8]))
+    _, state, played = jax.eval_shape(lanes.reset, table, jnp.arange(3))
+    step = lambda action: jax.eval_shape(lanes.step, table, played, state, action, jnp.arange(3))
+    assert step(jnp.zeros((6, 3), int))[3].shape == (3,)
+    for wrong in jnp.zeros(3, int), jnp.zeros((3, 6), int):
+        with pytest.raises(ValueError, match=r"actions have shape .*, but must have \(6, lanes\)"):
+            step(wrong)
+    discrete = Lanes(make(levels, "discrete")[0])
+    with pytest.raises(ValueError, match=r"but must have \(lanes\)"):
+        jax.eval_shape(discrete.step, table, played, state, jnp.zeros((6, 3), int), jnp.arange(3))
 
 
 def test_lane_state_contains_no_level_arrays(levels: Level) -> None:
