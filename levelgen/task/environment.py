@@ -161,6 +161,94 @@ def starts(levels: Level) -> EnvState:
     return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), states)
 
 
+@dataclass(frozen=True)
+class Interface:
+    """What decides an environment's steps, but for its levels.
+
+    Equal by value, so environments that differ in their levels share compiled programs, and no program keeps levels
+    in memory.
+    """
+
+    action_type: ActionType
+    observation_type: ObservationType
+    rules: TaskParams
+    auto_reset: bool
+    final_observation: bool
+
+    @partial(jax.jit, static_argnums=0)
+    def reset(self, key: Key[Array, ""], params: EnvParams, override: EnvState | None) -> tuple[Any, EnvState]:
+        """See `Environment.reset`."""
+        levels, index, override = self._restart(key, params, override, 0)
+        return single(self._reset_lanes)(levels, index, (override, jnp.asarray(index)))
+
+    @partial(jax.jit, static_argnums=0)
+    def step(
+        self, key: Key[Array, ""], state: EnvState, action: Array, params: EnvParams, override: EnvState | None
+    ) -> Step:
+        """See `Environment.step`."""
+        self._check(action)
+        table, index, override = self._restart(key, params, override, state.episode + 1)
+        return single(self._step_lanes)(table, index, (override, jnp.asarray(index), *_detached(state, action)))
+
+    @partial(jax.jit, static_argnums=0)
+    def step_env(self, state: EnvState, action: Array) -> Step:
+        """See `Environment.step_env`."""
+        self._check(action)
+        return single(self._step_lanes)((), 0, (None, None, *_detached(state, action)))
+
+    def _check(self, action: Array) -> None:
+        """Raise ValueError if the action's shape does not fit the action type."""
+        if (shape := jnp.shape(action)) != (wanted := () if self.action_type == ActionType.DISCRETE else (ACTIONS,)):
+            raise ValueError(
+                f"an action has shape {shape}, but must be {wanted} for action_type={str(self.action_type)!r}"
+            )
+
+    def _restart(
+        self, key: Key[Array, ""], params: EnvParams, override: EnvState | None, episode: Int[Array, ""] | int
+    ) -> tuple[Any, Array | int, Any]:
+        """Return a reset's (levels to draw from, index of the drawn one, state that replaces both, if any)."""
+        if override is not None:
+            return (), 0, override
+        levels = params.levels
+        if isinstance(levels, Sampler):
+            return levels, levels.draw_id(_level_key(key, episode)), None
+        return on_device(levels), _draw_level(key, episode, len(levels)), None
+
+    def _reset_lanes(
+        self, levels: Any, row: Int[Array, " lane"], inputs: tuple[EnvState | None, Array]
+    ) -> tuple[Any, EnvState]:
+        override, index = inputs
+        state = _first_state(levels, row, index, 0, override)
+        return self.observe(state), state
+
+    def _step_lanes(self, levels: Any, row: Int[Array, " lane"], inputs: tuple[Any, Any, EnvState, Array]) -> Step:
+        """Take one env step in every lane; reset if there are levels or an override state.
+
+        Args:
+            levels: as `_restart` returns them; () for no reset.
+            row: of the level to reset to. If the caller maps over `params`, `levels` holds the levels of all lanes.
+            inputs: (override state or None, index that `_restart` returned, state, action).
+        """
+        override, index, state, action = inputs
+        driven = CONTROLS[self.action_type](state.level, action)
+        now, result, closing, _ = task.advance_driven(state.level, state.now, driven, self.rules)
+        after = state.with_task_state(now)
+        info = info_of(result, closing, state.level_index)
+        if self.final_observation:
+            info["final_observation"] = self.observe(after)
+        if override is None and isinstance(levels, Sampler):
+            begin = lambda ids: EnvState.start(levels.lanes(ids), ids)
+            after = replace(renewed(result.done, index, begin, after), episode=state.episode + result.done)
+        elif override is not None or isinstance(levels, Level):
+            restart = _first_state(levels, row, index, state.episode + 1, override)
+            after = jax.tree.map(lambda fresh, x: jnp.where(result.done, fresh, x), restart, after)
+        return self.observe(after), after, result.reward, result.done, info
+
+    def observe(self, state: EnvState) -> Any:
+        """Return the observation of each lane."""
+        return observe(self.observation_type, state.level, state.level.state)
+
+
 @dataclass(frozen=True, eq=False)
 class Environment:
     """An environment, created by `make`. Equal only to itself, so it can be a static argument."""
@@ -178,6 +266,10 @@ class Environment:
         return EnvParams(self.levels)
 
     @property
+    def _interface(self) -> "Interface":
+        return Interface(self.action_type, self.observation_type, self.rules, self.auto_reset, self.final_observation)
+
+    @property
     def size(self) -> Size:
         return self.levels.size
 
@@ -190,15 +282,12 @@ class Environment:
         """Number of discrete actions, or of entries of an action."""
         return DISCRETE_ACTIONS if self.action_type == ActionType.DISCRETE else ACTIONS
 
-    @partial(jax.jit, static_argnums=0)
     def reset(
         self, key: Key[Array, ""], params: EnvParams | None = None, override_reset_state: EnvState | None = None
     ) -> tuple[Any, EnvState]:
         """Start an episode, in `override_reset_state` if given: return its observation and state."""
-        levels, index, override = self._restart(key, params, override_reset_state, 0)
-        return single(self._reset_lanes)(levels, index, (override, jnp.asarray(index)))
+        return self._interface.reset(key, params or self.default_params, override_reset_state)
 
-    @partial(jax.jit, static_argnums=0)
     def step(
         self,
         key: Key[Array, ""],
@@ -221,31 +310,21 @@ class Environment:
             level_index: index of the step's level in `params.levels`, or its id (as `EnvState.level_index`).
             final_observation: observation at the end of the step, before any reset; only if `make` enabled it.
         """
-        self._check(action)
         if not self.auto_reset:
             return self.step_env(key, state, action, params)
-        table, index, override = self._restart(key, params, override_reset_state, state.episode + 1)
-        return single(self._step_lanes)(table, index, (override, jnp.asarray(index), *_detached(state, action)))
+        return self._interface.step(key, state, action, params or self.default_params, override_reset_state)
 
     def step_env(self, key: Key[Array, ""], state: EnvState, action: Array, params: EnvParams | None = None) -> Step:
         """Take one env step without reset."""
         del key, params  # env steps are deterministic
-        self._check(action)
-        return single(self._step_lanes)((), 0, (None, None, *_detached(state, action)))
-
-    def _check(self, action: Array) -> None:
-        """Raise ValueError if the action's shape does not fit the action type."""
-        if (shape := jnp.shape(action)) != (wanted := () if self.action_type == ActionType.DISCRETE else (ACTIONS,)):
-            raise ValueError(
-                f"an action has shape {shape}, but must be {wanted} for action_type={str(self.action_type)!r}"
-            )
+        return self._interface.step_env(state, action)
 
     def reset_env(self, key: Key[Array, ""], params: EnvParams | None = None) -> tuple[Any, EnvState]:
         return self.reset(key, params)
 
     def get_obs(self, state: EnvState) -> Any:
         """Return the observation of a state."""
-        return single(lambda table, index, state: self._observe(state))((), 0, state)
+        return single(lambda table, index, state: self._interface.observe(state))((), 0, state)
 
     def action_space(self, params: EnvParams | None = None) -> Space:
         del params
@@ -265,50 +344,6 @@ class Environment:
         if self.observation_type == ObservationType.PIXELS:
             return Dict({"image": Box(0.0, 1.0, (SIDE, SIDE, 3)), "global_info": Box(-jnp.inf, jnp.inf, (1,))})
         return _space_of_entities(jax.eval_shape(lambda: self.reset(jax.random.key(0))[0]), self.size)
-
-    def _restart(
-        self, key: Key[Array, ""], params: EnvParams | None, override: EnvState | None, episode: Int[Array, ""] | int
-    ) -> tuple[Any, Array | int, Any]:
-        """Return a reset's (levels to draw from, index of the drawn one, state that replaces both, if any)."""
-        if override is not None:
-            return (), 0, override
-        levels = (params or self.default_params).levels
-        if isinstance(levels, Sampler):
-            return levels, levels.draw_id(_level_key(key, episode)), None
-        return on_device(levels), _draw_level(key, episode, len(levels)), None
-
-    def _reset_lanes(
-        self, levels: Any, row: Int[Array, " lane"], inputs: tuple[EnvState | None, Array]
-    ) -> tuple[Any, EnvState]:
-        override, index = inputs
-        state = _first_state(levels, row, index, 0, override)
-        return self._observe(state), state
-
-    def _step_lanes(self, levels: Any, row: Int[Array, " lane"], inputs: tuple[Any, Any, EnvState, Array]) -> Step:
-        """Take one env step in every lane; reset if there are levels or an override state.
-
-        Args:
-            levels: as `_restart` returns them; () for no reset.
-            row: of the level to reset to. If the caller maps over `params`, `levels` holds the levels of all lanes.
-            inputs: (override state or None, index that `_restart` returned, state, action).
-        """
-        override, index, state, action = inputs
-        driven = CONTROLS[self.action_type](state.level, action)
-        now, result, closing, _ = task.advance_driven(state.level, state.now, driven, self.rules)
-        after = state.with_task_state(now)
-        info = info_of(result, closing, state.level_index)
-        if self.final_observation:
-            info["final_observation"] = self._observe(after)
-        if override is None and isinstance(levels, Sampler):
-            begin = lambda ids: EnvState.start(levels.lanes(ids), ids)
-            after = replace(renewed(result.done, index, begin, after), episode=state.episode + result.done)
-        elif override is not None or isinstance(levels, Level):
-            restart = _first_state(levels, row, index, state.episode + 1, override)
-            after = jax.tree.map(lambda fresh, x: jnp.where(result.done, fresh, x), restart, after)
-        return self._observe(after), after, result.reward, result.done, info
-
-    def _observe(self, state: EnvState) -> Any:
-        return observe(self.observation_type, state.level, state.level.state)
 
 
 def _detached(*inputs: Any) -> Any:

@@ -1,5 +1,7 @@
 """The environment for users of gymnax: single, mapped, mapped twice or around loops, always the same world."""
 
+import gc
+import weakref
 from dataclasses import replace
 
 import jax
@@ -17,6 +19,7 @@ from levelproof.levelgen.task.environment import (
     Environment,
     EnvParams,
     EnvState,
+    Interface,
     ObservationType,
     make,
     starts,
@@ -298,6 +301,20 @@ def test_step_refuses_an_action_of_another_type(levels: Level) -> None:
 def test_make_refuses_no_levels(levels: Level) -> None:
     with pytest.raises(ValueError, match="give at least one level, level axis last"):
         make(jax.tree.map(lambda x: x[..., :0], levels))
+
+
+def test_equal_settings_share_programs_which_keep_no_levels(levels: Level) -> None:
+    made = []
+    for some in levels[:4], levels[4:8]:
+        env, params = make(some)
+        _, state = env.reset(jax.random.key(0))
+        assert (np.asarray(state.level.role)[:, None] == some.role).all(0).any()
+        env.step(jax.random.key(1), state, jnp.zeros(6, int))
+        made.append((weakref.ref(env), weakref.ref(params.levels.role), Interface.step._cache_size()))
+    del env, params, state
+    gc.collect()
+    assert [(env(), role()) for env, role, _ in made] == [(None, None)] * 2
+    assert made[0][2] == made[1][2]
 
 
 def test_levels_of_other_axes_and_types_are_refused(levels: Level) -> None:
