@@ -2,7 +2,7 @@
 "use strict";
 
 (function () {
-  const { metresOf } = window.levelproof;
+  const { create, keyOf, listOf, metresOf, usesKey } = window.levelproof;
   const at = (id) => document.getElementById(id);
   const NEAR = 0.14; // m; a click this near selects a joint or thruster
   const TURN = Math.PI / 12; // rad per click
@@ -23,8 +23,7 @@
       Object.assign(this, { link, stage, changed, begin, tool: "select", drag: null });
       const buttons = Object.entries(TOOLS).map(([tool, [words]]) => this.button(words, () => this.take(tool), { role: "radio", "data-tool": tool }));
       at("tools").replaceChildren(...buttons);
-      at("undo").addEventListener("click", () => this.change("undo"));
-      at("redo").addEventListener("click", () => this.change("redo"));
+      for (const name of ["undo", "redo"]) at(name).addEventListener("click", () => this.change(name));
       stage.canvas.addEventListener("pointerdown", (event) => this.down(event));
       stage.canvas.addEventListener("pointermove", (event) => this.moved(event));
       stage.canvas.addEventListener("pointerup", (event) => this.up(event));
@@ -34,12 +33,7 @@
     }
 
     button(words, action, attributes = {}) {
-      const button = document.createElement("button");
-      button.type = "button";
-      button.textContent = words;
-      for (const [name, value] of Object.entries(attributes)) button.setAttribute(name, value);
-      button.addEventListener("click", action);
-      return button;
+      return create("button", { type: "button", click: action, ...attributes }, words);
     }
 
     take(tool) {
@@ -56,14 +50,9 @@
       this.select(this.found(this.stage.selected));
     }
 
-    // The numbers of all entities of a kind, in drawing order.
-    numbers(kind) {
-      return this.level[{ body: "bodies", joint: "joints", thruster: "thrusters" }[kind]];
-    }
-
     // The same entity in the current level, whose drawing order may differ; null if it is gone.
     found(entity) {
-      const index = entity ? this.numbers(entity.kind).indexOf(entity.number) : -1;
+      const index = entity ? listOf(entity.kind, this.level).indexOf(entity.number) : -1;
       return index < 0 ? null : { ...entity, index };
     }
 
@@ -98,10 +87,9 @@
     // Select a joint or thruster near a point, else the topmost body there.
     async pick(x, y) {
       for (const kind of ["thruster", "joint"]) {
-        const entities = kind === "joint" ? this.stage.world.joints : this.stage.world.thrusters;
-        for (let index = 0; index < entities.length; index++) {
+        for (const [index, number] of listOf(kind, this.level).entries()) {
           const point = this.stage.pointOf({ kind, index });
-          if (Math.hypot(point[0] - x, point[1] - y) < NEAR) return this.select({ kind, index, number: this.numbers(kind)[index] });
+          if (Math.hypot(point[0] - x, point[1] - y) < NEAR) return this.select({ kind, index, number });
         }
       }
       this.drag = { from: [x, y] };
@@ -156,7 +144,7 @@
       const remove = () => { this.stage.selected = null; this.edit("delete", kind, number); };
       if (!scenery) this.remove = this.button("Delete", remove);
       if (kind !== "body") {
-        const { binding, fixed, motor, auto } = (kind === "joint" ? this.stage.world.joints : this.stage.world.thrusters)[index];
+        const { binding, fixed, motor, auto } = listOf(kind, this.stage.world)[index];
         const obeys = kind === "thruster" || (motor && !auto);
         const rest = fixed ? "Fixed joint" : motor ? "Motor that always runs" : "Joint without a motor";
         at("what").textContent = obeys ? `${kind === "joint" ? "Motor" : "Thruster"}, obeys ${levelproof.entryName(binding)}` : rest;
@@ -179,10 +167,11 @@
     }
 
     key(event) {
-      if (/^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName)) return;
-      const isUndo = (event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z";
-      if (isUndo) this.change(event.shiftKey ? "redo" : "undo");
-      else if (event.key === "Delete" && this.remove) this.remove.click();
+      const key = keyOf(event);
+      if (usesKey(event.target, key)) return;
+      const isUndo = (event.ctrlKey || event.metaKey) && key === "z";
+      if (isUndo) at(event.shiftKey ? "redo" : "undo").click(); // nothing happens if there is nothing to undo
+      else if (key === "Delete" && this.remove) this.remove.click();
       else return;
       event.preventDefault();
     }

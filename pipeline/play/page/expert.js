@@ -2,7 +2,7 @@
 "use strict";
 
 (function () {
-  const { drawCurve, drawWorld } = window.levelproof;
+  const { create, drawCurve, drawWorld } = window.levelproof;
   const at = (id) => document.getElementById(id);
   const STAGES = {
     compiling: "Loading the programs of this size; the first time takes a minute",
@@ -56,11 +56,7 @@
     attempts({ attempts, goals }) {
       at("attempts").hidden = false;
       if (at("attempts").children.length !== attempts.length) {
-        at("attempts").replaceChildren(...attempts.map(() => {
-          const canvas = document.createElement("canvas");
-          canvas.width = canvas.height = SMALL;
-          return canvas;
-        }));
+        at("attempts").replaceChildren(...attempts.map(() => create("canvas", { width: SMALL, height: SMALL })));
       }
       const began = performance.now();
       const film = (this.film = {});

@@ -2,7 +2,7 @@
 "use strict";
 
 (function () {
-  const { liveEntries, entryName, many } = window.levelproof;
+  const { create, keyOf, usesKey, liveEntries, entryName, many } = window.levelproof;
   const at = (id) => document.getElementById(id);
   // Key: [entry of the action, value]; as in the reference's editor, plus letters for the motors it has no keys for.
   const KEYS = {
@@ -45,17 +45,16 @@
       const keys = Object.entries(KEYS).filter(([, [entry]]) => live.includes(entry)).sort((a, b) => a[1][0] - b[1][0]);
       this.buttons = new Map();
       at("pads").replaceChildren(...keys.map(([key, [entry, value]]) => {
-        const button = document.createElement("button");
         const effect = entry < 4 ? ["", "forward", "back"][value] : "on";
-        button.type = "button";
-        button.style.setProperty("--colour", `var(--binding-${entry})`);
-        button.textContent = `${NAMES[key] || key} ${entryName(entry)} ${effect}`;
-        button.addEventListener("pointerdown", (event) => {
+        const release = () => this.release(key);
+        const press = (event) => {
           if (event.button) return;
           button.setPointerCapture(event.pointerId);
           this.press(key);
-        });
-        for (const end of ["pointerup", "pointercancel"]) button.addEventListener(end, () => this.release(key));
+        };
+        const button = create("button", {
+          type: "button", style: `--colour: var(--binding-${entry})`, pointerdown: press, pointerup: release, pointercancel: release,
+        }, `${NAMES[key] || key} ${entryName(entry)} ${effect}`);
         this.buttons.set(key, button);
         return button;
       }));
@@ -68,15 +67,16 @@
         this.codes.delete(event.code);
         return;
       }
-      if (event.ctrlKey || event.metaKey || event.altKey || /^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName)) return;
-      const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+      const key = keyOf(event);
+      if (event.ctrlKey || event.metaKey || event.altKey) return;
+      if (usesKey(event.target, key) && !event.target.closest("#pads")) return;
       if (this.buttons && this.buttons.has(key)) {
         event.preventDefault();
         if (event.repeat) return;
         this.codes.set(event.code, key);
         this.press(key);
       } else if (key === "r") this.restart();
-      else if (key === " " && (event.target.tagName !== "BUTTON" || event.target.closest("#pads"))) {
+      else if (key === " ") {
         event.preventDefault();
         this.play(!this.playing);
       }

@@ -4,6 +4,9 @@
 (function () {
   const { attached, drawWorld, coloursOf, fit, worldOf } = window.levelproof;
 
+  // The bodies, joints or thrusters of a world, or their numbers in a level.
+  const listOf = (kind, of) => of[{ body: "bodies", joint: "joints", thruster: "thrusters" }[kind]];
+
   class Stage {
     constructor(canvas) {
       this.canvas = canvas;
@@ -55,10 +58,10 @@
     pointOf({ kind, index }) {
       const places = this.places || this.world.start;
       if (kind === "body") return index < this.world.bodies.length ? [places[3 * index], places[3 * index + 1]] : null;
-      const entity = (kind === "joint" ? this.world.joints : this.world.thrusters)[index];
+      const entity = listOf(kind, this.world)[index];
       return entity ? attached(places, entity.body, entity.anchor || entity.position) : null;
     }
   }
 
-  levelproof.Stage = Stage;
+  Object.assign(levelproof, { Stage, listOf });
 })();

@@ -64,9 +64,9 @@
       this.rows += count;
     }
 
-    word(name, row) {
-      const { words } = this.about.columns.find((column) => column.name === name);
-      return words[this.values[name][row]];
+    // The list of a column's words; undefined if it has numbers, or there is none of that name.
+    words(name) {
+      return this.about.columns.find((column) => column.name === name)?.words;
     }
   }
 

@@ -110,7 +110,6 @@
       const link = create("a", {}, canvas, create("p", { "aria-hidden": "true" }, dot, name, detail));
       const element = create("div", { class: "cell", role: "listitem" }, link);
       const cell = { element, link, canvas, dot, name, detail };
-      element.index = 0;
       this.element.append(element);
       return cell;
     }
@@ -125,7 +124,7 @@
     fill(cell, index) {
       const row = this.rows[index];
       const id = this.columns.values.level_id[row];
-      const label = this.columns.word("label", row);
+      const label = this.columns.words("label")[this.columns.values.label[row]];
       const value = this.columns.values[this.detail][row];
       const unit = this.detail === "steps_to_goal" ? ` step${value === 1 ? "" : "s"}` : "";
       const detail = Number.isNaN(value) ? label : formatted(value) + unit;

@@ -3,7 +3,9 @@
 "use strict";
 
 (function () {
-  const { load, create, readable, formatted, statesOf, between, bytesOf, liveEntries, entryName, drawWorld, many } = window.levelproof;
+  const {
+    load, create, keyOf, usesKey, readable, formatted, statesOf, between, bytesOf, liveEntries, entryName, drawWorld, many,
+  } = window.levelproof;
   const ENTRIES = 6; // entries of an action
   const REST = 0.8; // s; pause on the last picture before the witness restarts
   const at = (id) => document.getElementById(id);
@@ -171,7 +173,8 @@
 
     key(event) {
       if (this.row === null || event.ctrlKey || event.metaKey || event.altKey) return;
-      if (usesKey(event.target, event.key)) return;
+      const key = keyOf(event);
+      if (usesKey(event.target, key)) return;
       const deeds = {
         " ": () => this.play(!this.playing),
         ArrowLeft: () => this.back(),
@@ -182,17 +185,10 @@
         n: () => at("next").click(),
         p: () => at("previous").click(),
       };
-      const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
       if (!deeds[key]) return;
       event.preventDefault();
       deeds[key]();
     }
-  }
-
-  // Whether the focused element has a use of its own for a key: buttons are pressed, words are typed.
-  function usesKey({ tagName, type }, key) {
-    if (tagName === "SELECT" || (tagName === "INPUT" && !/^(checkbox|range)$/.test(type))) return key !== "Escape";
-    return /^(BUTTON|A|INPUT)$/.test(tagName) && (key === " " || key === "Enter");
   }
 
   // Decode an episode, of a witness or a policy; null if there is none.

@@ -12,14 +12,11 @@
 
   const hrefOf = (row) => `#level=${columns.values.level_id[row]}`;
 
-  function wordsOf(name) {
-    return columns.about.columns.find((column) => column.name === name)?.words;
-  }
-
   // Encode the conditions and the order as an address.
   function addressOf() {
     const parts = [...choice.conditions].map(([name, condition]) => {
-      const value = condition instanceof Set ? [...condition].map((index) => wordsOf(name)[index]) : [condition.join("..")];
+      const value = condition instanceof Set ? [...condition].map((index) => columns.words(name)[index])
+        : [condition.map((end) => (Number.isFinite(end) ? end : "")).join("..")];
       return `${name}=${value.map(encodeURIComponent).join(",")}`;
     });
     const [name, direction] = choice.sortedBy;
@@ -43,7 +40,7 @@
     for (const part of address.slice(1).split("&").filter(Boolean)) {
       const [name, value = ""] = part.split("=");
       if (name === "sort" && columns.values[value.replace("-", "")]) choice.sort(value.replace("-", ""), value[0] === "-" ? -1 : 1);
-      const words = wordsOf(name);
+      const words = columns.words(name);
       if (words) {
         const indices = value.split(",").map((word) => words.indexOf(decoded(word))).filter((index) => index >= 0);
         if (indices.length) choice.set(name, new Set(indices));

@@ -3,23 +3,12 @@
 "use strict";
 
 (function () {
-  const { binsOf } = window.levelproof;
+  const { binsOf, create } = window.levelproof;
   const FIRST = ["steps_to_goal", "env_steps", "success_rate", "portability", "bodies", "joints", "motors", "thrusters"];
   const [FEW, SHORT] = [8, 24]; // maximum number of words, and of their letters, for buttons; else a list
   const [WIDE, HIGH] = [320, 46]; // size of a histogram's view box
   const SLACK = 1e-9; // share of a bin by which ends of bins may be rounded
-  const SVG = "http://www.w3.org/2000/svg";
-
-  function create(tag, attributes = {}, ...inside) {
-    const element = attributes.svg ? document.createElementNS(SVG, tag) : document.createElement(tag);
-    for (const [name, value] of Object.entries(attributes)) {
-      if (name === "svg" || value === undefined) continue;
-      if (typeof value === "function") element.addEventListener(name, value);
-      else element.setAttribute(name, value);
-    }
-    element.append(...inside);
-    return element;
-  }
+  const OPEN = [-Infinity, Infinity]; // limits that nobody chose, and fields without a number
 
   const readable = (name) => name.replaceAll("_", " ");
 
@@ -206,5 +195,5 @@
     }
   }
 
-  Object.assign(window.levelproof, { Panel, create, readable, formatted });
+  Object.assign(window.levelproof, { Panel, readable, formatted });
 })();
