@@ -164,33 +164,6 @@ def test_grid_of_millions_of_levels_is_no_higher_than_browsers_show(page: Any, a
     assert int(page.evaluate("document.activeElement.closest('.cell').ariaPosInSet")) in page.evaluate(SHOWN)
 
 
-def test_address_keeps_filters_and_order(page: Any, address: str, split: Path) -> None:
-    page.goto(address)
-    wait_until_drawn(page)
-    page.get_by_role("button", name=re.compile("^solved")).click()
-    count = sum(row["label"] == "solved" for row in rows(split))
-    assert page.locator("#count").inner_text() == f"{count} of {PLAYED} levels"
-    box = page.get_by_label(re.compile("^Histogram of thrusters")).bounding_box()
-    page.mouse.move(box["x"] + 2, box["y"] + 20)
-    page.mouse.down()
-    page.mouse.move(box["x"] + box["width"] * 0.3, box["y"] + 20, steps=4)
-    page.mouse.up()
-    brushed = int(page.locator("#count").inner_text().split(" of ")[0])
-    assert 0 < brushed < count
-    assert re.search(r"#label=solved&thrusters=\d\.\.\d$", page.url)
-    page.select_option("#sort", "level_id")
-    page.locator("#direction").click()
-    first = page.locator("[aria-posinset='1'] a")
-    shown = first.get_attribute("href")
-    page.reload()
-    wait_until_drawn(page)
-    assert page.locator("#count").inner_text() == f"{brushed} of {PLAYED} levels"
-    assert first.get_attribute("href") == shown
-    page.locator("#clear").click()
-    assert page.locator("#count").inner_text() == f"{PLAYED} levels"
-    assert first.get_attribute("href") == f"#level={PLAYED - 1}"
-
-
 def test_level_page_plays_the_record(page: Any, address: str, split: Path) -> None:
     level_id = solved(split)
     page.goto(f"{address}#level={level_id}")
@@ -215,24 +188,6 @@ def test_level_page_plays_the_record(page: Any, address: str, split: Path) -> No
     assert page.locator("#reason").inner_text() == "Made for a test."
     assert "to 50%" in page.locator("#curve").get_attribute("aria-label")
     assert page.evaluate(UNNAMED) == []
-
-
-def test_typed_limits_are_exact(page: Any, address: str, split: Path) -> None:
-    """Typing one limit leaves the other as it is, and both are shown in full."""
-    page.goto(f"{address}#thrusters=0.12345678..5.87654321")
-    wait_until_drawn(page)
-    lower, upper = (page.get_by_label(f"thrusters, {end}", exact=True) for end in ("at least", "at most"))
-    assert (lower.input_value(), upper.input_value()) == ("0.12345678", "5.87654321")
-    upper.fill("5.5")
-    upper.press("Enter")
-    assert page.url.endswith("#thrusters=0.12345678..5.5")
-
-
-def test_address_that_is_cut_off_shows_what_is_left(page: Any, address: str, split: Path) -> None:
-    page.goto(f"{address}#label=%,solved&label_reason=%E2%8")
-    wait_until_drawn(page)
-    count = sum(row["label"] == "solved" for row in rows(split))
-    assert page.locator("#count").inner_text() == f"{count} of {PLAYED} levels"
 
 
 def test_keys_work_after_a_button_and_in_capitals(page: Any, address: str, split: Path) -> None:

@@ -67,10 +67,16 @@
     if (page.row !== null) neighbours(page.row);
   }
 
-  function changed() {
+  // Show a changed choice. Browsers refuse addresses that change often, so a brush writes it at its end.
+  function changed(brushing = false) {
     overview = addressOf();
-    history.replaceState(null, "", overview);
     refresh();
+    if (brushing) return;
+    try {
+      history.replaceState(null, "", overview);
+    } catch (error) {
+      if (error.name !== "SecurityError") throw error; // the page shows the choice; the next change writes the address
+    }
   }
 
   // Link a level's page to the levels before and after it, among those chosen.

@@ -70,7 +70,7 @@
       this.drawing = create("svg", {
         svg: true, viewBox: `0 0 ${WIDE} ${HIGH}`, preserveAspectRatio: "none", role: "img",
         pointerdown: (event) => this.begin(event), pointermove: (event) => this.drag(event), pointerup: () => this.end(),
-        pointercancel: () => { this.from = undefined; },
+        pointercancel: () => this.end(false),
       }, this.all, this.brush, this.chosen);
       this.clear = create("button", { type: "button", "aria-label": `Clear ${readable(name)}`, click: () => this.choose(null) }, "clear");
       this.inputs = ["at least", "at most"].map((words, end) =>
@@ -99,12 +99,14 @@
       if (to === this.from && !this.moved) return;
       if (this.moved && to === this.to) return;
       [this.moved, this.to] = [true, to];
-      this.choose(this.range(Math.min(this.from, to), Math.max(this.from, to)));
+      this.choose(this.range(Math.min(this.from, to), Math.max(this.from, to)), true);
     }
 
-    // A click chooses one bin.
-    end() {
-      if (this.from !== undefined && !this.moved) this.choose(this.range(this.from, this.from));
+    // A click chooses one bin; a brush ends.
+    end(clicks = true) {
+      if (this.from === undefined) return;
+      if (this.moved) this.changed();
+      else if (clicks) this.choose(this.range(this.from, this.from));
       this.from = undefined;
     }
 
@@ -125,9 +127,9 @@
       this.choose(this.inputs.every((input) => input.value === "") ? null : range);
     }
 
-    choose(range) {
+    choose(range, brushing = false) {
       this.choice.set(this.name, range);
-      this.changed();
+      this.changed(brushing);
     }
 
     refresh() {
