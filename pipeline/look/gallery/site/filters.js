@@ -9,7 +9,7 @@
   class Choice {
     constructor(columns) {
       this.columns = columns;
-      this.conditions = new Map(); // column: Set of word indices, or [low, high]
+      this.conditions = new Map(); // column: Set of word indices, or [low, high], infinite where there is no limit
       this.fails = new Map(); // column: 1 for each row that fails its condition, else 0
       this.failures = new Uint8Array(columns.about.levels);
       this.sortedBy = ["level_id", 1]; // column, and 1 ascending or -1 descending

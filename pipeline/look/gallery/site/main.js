@@ -45,8 +45,9 @@
         const indices = value.split(",").map((word) => words.indexOf(decoded(word))).filter((index) => index >= 0);
         if (indices.length) choice.set(name, new Set(indices));
       } else if (columns.values[name]) {
-        const [low, high] = value.split("..").map(Number);
-        if (low <= high) choice.set(name, [low, high]);
+        const [low, high] = value.split("..");
+        const range = [low === "" ? -Infinity : Number(low), high === "" ? Infinity : Number(high)];
+        if (range[0] <= range[1]) choice.set(name, range);
       }
     }
   }

@@ -110,21 +110,20 @@
       this.from = undefined;
     }
 
-    // The values of some bins, which do not include their upper end, except for the last one.
+    // The values of some bins, which do not include their upper end. The first and the last bin are open: rows that are
+    // yet to come may lie beyond them.
     range(first, last) {
-      const { low, high, width, whole, count } = this.bins;
+      const { low, width, whole, count } = this.bins;
       const end = low + (last + 1) * width;
-      const upper = last === count - 1 ? high : whole ? Math.min(high, end - 1) : end - SLACK * width;
-      return [low + first * width, upper];
+      return [first ? low + first * width : OPEN[0], last === count - 1 ? OPEN[1] : whole ? end - 1 : end - SLACK * width];
     }
 
     // Take the limit that was typed, 0 the lower or 1 the upper; the other stays.
     typed(end) {
-      const all = [this.bins.low, this.bins.high];
-      const range = [...(this.choice.conditions.get(this.name) || all)];
-      range[end] = this.inputs[end].value === "" ? all[end] : Number(this.inputs[end].value);
+      const range = [...(this.choice.conditions.get(this.name) || OPEN)];
+      range[end] = this.inputs[end].value === "" ? OPEN[end] : Number(this.inputs[end].value);
       if (range[0] > range[1]) range[1 - end] = range[end];
-      this.choose(this.inputs.every((input) => input.value === "") ? null : range);
+      this.choose(range.some(Number.isFinite) ? range : null);
     }
 
     choose(range, brushing = false) {
@@ -157,7 +156,7 @@
       this.clear.hidden = !range;
       [low, high].forEach((end, i) => {
         this.inputs[i].placeholder = formatted(end);
-        this.inputs[i].value = range ? String(range[i]) : "";
+        this.inputs[i].value = range && Number.isFinite(range[i]) ? String(range[i]) : "";
       });
       const total = chosen.reduce((sum, rows) => sum + rows, 0);
       this.drawing.setAttribute("aria-label", `Histogram of ${readable(this.name)}: ${total} levels between ${formatted(low)} and ${formatted(high)}`);
