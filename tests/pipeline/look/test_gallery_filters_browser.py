@@ -1,12 +1,17 @@
 """The gallery's filters in a real browser."""
 
+import json
 import re
+import shutil
+from base64 import b64decode, b64encode
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.pipeline.command import ROOT
+from tests.pipeline.look.test_gallery import data, numbers
 from tests.pipeline.look.test_gallery_browser import address, chromium, page, rows, wait_until_drawn
 from tests.pipeline.made import PLAYED
 
@@ -87,6 +92,45 @@ def test_limit_that_is_emptied_is_no_condition(page: Any) -> None:
         least.press("Enter")
         assert page.url.endswith(end)
         assert page.locator("#count").inner_text() == count
+
+
+HOLDING = """(() => {
+    const append = Element.prototype.append;
+    Element.prototype.append = function (...nodes) {
+        if (nodes[0]?.src?.endsWith("columns/1.js")) window.arrive = () => append.apply(this, nodes);
+        else append.apply(this, nodes);
+    };
+})()"""
+FOCUSED = "document.activeElement.closest('.cell')?.firstChild.ariaLabel"
+
+
+def test_levels_that_arrive_later_meet_open_limits_and_leave_the_focus(page: Any, tmp_path: Path) -> None:
+    """The longest witness lies beyond the last bar that the histogram has before."""
+    site = Path(shutil.copytree(EXAMPLE, tmp_path / "site"))
+    columns = {name: b64decode(text) for name, text in data(site, "columns/0").items()}
+    steps = dict(enumerate(numbers(data(site, "columns/0")["steps_to_goal"], "<f4")))
+    first = max(steps, key=lambda level_id: np.nan_to_num(steps[level_id]))  # of the second page
+    for number, here in enumerate((slice(0, first), slice(first, None))):
+        part = {name: np.frombuffer(values, f"V{len(values) // len(steps)}")[here] for name, values in columns.items()}
+        encoded = json.dumps({name: b64encode(values.tobytes()).decode() for name, values in part.items()})
+        (site / f"data/columns/{number}.js").write_text(f'levelproof.arrived("columns/{number}",{encoded});\n')
+    page.add_init_script(HOLDING)
+    page.goto((site / "index.html").as_uri())
+    wait_until_drawn(page)
+    brush(page, "steps to goal", first=0.1, last=1)
+    low = int(re.search(r"#steps_to_goal=(\d+)\.\.$", page.url)[1])  # pyright: ignore[reportOptionalSubscript]
+    page.select_option("#sort", "steps_to_goal")
+    page.locator("#direction").click()
+    assert page.locator("#count").inner_text().endswith(f" of {first} levels, more to come")
+    page.locator("[aria-posinset='1'] a").focus()
+    focused = page.evaluate(FOCUSED)
+    page.evaluate("arrive()")
+    page.wait_for_function("performance.getEntriesByName('all columns are there').length > 0")
+    some = sorted((level_id for level_id in steps if steps[level_id] >= low), key=lambda level_id: -steps[level_id])
+    assert page.locator("#count").inner_text() == f"{len(some)} of {len(steps)} levels"
+    assert page.evaluate(FOCUSED) == focused
+    assert focused.startswith(f"Level {some[1]}, ")
+    assert page.evaluate("document.activeElement.closest('.cell').ariaPosInSet") == "2"
 
 
 def test_address_that_is_cut_off_shows_what_is_left(page: Any, address: str, split: Path) -> None:

@@ -37,10 +37,19 @@
       });
     }
 
+    // Show other rows, or captions. A cell with the keyboard focus stays with its row; others whose row stays where it is
+    // are not drawn again.
     show(rows, detail) {
-      Object.assign(this, { rows, detail, current: 0 });
-      for (const cell of this.cells.values()) this.release(cell);
+      const cells = [...this.cells.values()];
+      const focused = cells.find((cell) => cell.element.contains(document.activeElement));
+      if (focused && rows[focused.element.index] !== focused.row) focused.element.index = rows.indexOf(focused.row);
+      Object.assign(this, { rows, detail, current: focused ? Math.max(0, focused.element.index) : 0 });
       this.cells.clear();
+      for (const cell of cells) {
+        const { index } = cell.element;
+        if (rows[index] === cell.row) this.cells.set(index, this.fill(cell, index));
+        else this.release(cell);
+      }
       this.element.querySelector(".nothing")?.remove();
       if (!rows.length) this.element.append(create("p", { class: "nothing" }, "No level matches: clear a filter."));
       this.layout();
@@ -128,7 +137,6 @@
       const value = this.columns.values[this.detail][row];
       const unit = this.detail === "steps_to_goal" ? ` step${value === 1 ? "" : "s"}` : "";
       const detail = Number.isNaN(value) ? label : formatted(value) + unit;
-      cell.row = row;
       cell.element.index = index;
       cell.element.hidden = false;
       cell.element.style.width = `${this.wide}px`;
@@ -144,6 +152,8 @@
       cell.name.textContent = id;
       cell.detail.textContent = detail;
       const pixels = Math.round((this.wide - 8) * Math.min(2, devicePixelRatio));
+      if (cell.row === row && cell.canvas.width === pixels) return cell; // it has been drawn, or waits for that
+      cell.row = row;
       if (cell.canvas.width !== pixels) cell.canvas.width = cell.canvas.height = pixels;
       else {
         const context = cell.canvas.getContext("2d");
