@@ -53,8 +53,10 @@ class Session:
             if name not in REQUESTS:
                 raise UserError(f"Unknown request {name!r}: use one of {', '.join(REQUESTS)}.")
             return REQUESTS[name](self, request)
-        except (UserError, EditError, LevelFileError) as error:
+        except (UserError, EditError) as error:
             return {"error": str(error)}
+        except LevelFileError as error:
+            return {"error": f"A level file cannot hold this level: {error}."}
         except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
             return {"error": f"The request is malformed ({type(error).__name__}: {error})."}
 
@@ -134,8 +136,11 @@ class Session:
         return self._open(file, None)
 
     def load(self, request: Message) -> Message:
-        """Open a level file's `document`."""
-        file = require_playable(from_document(request["document"]))
+        """Open a level file's `document`; `name` is the file's."""
+        try:
+            file = require_playable(from_document(request["document"]))
+        except LevelFileError as error:
+            raise UserError(f"Cannot use the level file {request['name']}: {error}.") from None
         return self._open(file, witness_in(request["document"], file))
 
     def save(self, _: Message) -> Message:

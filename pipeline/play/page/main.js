@@ -49,16 +49,17 @@
   at("open").addEventListener("change", async (event) => {
     const [file] = event.target.files;
     if (!file) return;
-    event.target.blur(); // else it takes the keys
+    const refuse = (reason) => levelproof.problem(`Cannot use the level file ${file.name}: ${reason}.`);
+    event.target.blur(); // else Space opens another file
     if (file.size > MAX_BYTES) { // a much larger one would close the connection without a message
-      levelproof.problem(`${file.name} is larger than any level file: it has ${(file.size / 1e6).toFixed(1)} MB.`);
+      refuse(`it has ${file.size.toLocaleString("en")} bytes, but no level needs more than ${MAX_BYTES.toLocaleString("en")}`);
       event.target.value = "";
       return;
     }
     try {
-      await open("load", { document: JSON.parse(await file.text()) });
+      await open("load", { name: file.name, document: JSON.parse(await file.text()) });
     } catch {
-      levelproof.problem(`${file.name} is not a level file: it is not JSON.`);
+      refuse("it is not JSON");
     }
     event.target.value = "";
   });

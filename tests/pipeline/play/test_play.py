@@ -139,7 +139,6 @@ def test_edits_are_applied_undone_and_refused(page: ClientConnection) -> None:
     for malformed in ({"ask": "__init__"}, {"ask": "edit"}, {"ask": "step", "action": [9] * 6}, {"ask": ["step"]}, {}):
         page.send(json.dumps(malformed))
         assert json.loads(page.recv(patience(ANSWER_SECONDS)))["error"].endswith(".")
-    assert ask(page, "load", document={"env_state": 1})["error"]
 
 
 @pytest.mark.campaign
@@ -214,6 +213,15 @@ def test_play_refuses_unplayable_arguments(split: Path, tmp_path: Path, address:
     assert level_to_play(level, None, None)[1] is None
     with pytest.raises(UserError, match="There is no split at"):
         level_to_play(tmp_path / "128k/x", None, None)
+
+
+def test_file_opened_on_the_page_is_refused_as_on_the_command_line(page: ClientConnection, tmp_path: Path) -> None:
+    document = {"env_state": {}}
+    path = tmp_path / "bad.json"
+    path.write_text(json.dumps(document))
+    with pytest.raises(UserError) as refused:
+        level_to_play(path, None, None)
+    assert ask(page, "load", name=str(path), document=document)["error"] == str(refused.value)
 
 
 def test_level_whose_steps_take_minutes_is_refused(page: ClientConnection, tmp_path: Path) -> None:

@@ -117,6 +117,13 @@ def test_delete_key_leaves_scenery_as_it_is(page: Any) -> None:
     page.wait_for_selector("#what:text-is('Plain body, cannot move')")
 
 
+def test_page_says_which_file_is_no_level(page: Any, tmp_path: Path) -> None:
+    for text, problem in (("{}", "env_state is missing."), ("{", "it is not JSON.")):
+        (tmp_path / "bad.json").write_text(text)
+        page.locator("#open").set_input_files(tmp_path / "bad.json")
+        page.wait_for_selector(f"#problem:text-is('Cannot use the level file bad.json: {problem}')")
+
+
 def test_film_ends_when_another_level_is_opened(page: Any, tmp_path: Path) -> None:
     session = Session(empty_file("m"))
     for name, *values in driven_by_a_thruster():
