@@ -56,7 +56,9 @@
       return index < 0 ? null : { ...entity, index };
     }
 
+    // Ask for a change, at the start of the level on the page and in the engine, which a refused change leaves as it is.
     async change(name, fields) {
+      this.begin();
       try {
         this.changed(await this.link.ask(name, fields));
         levelproof.problem("");

@@ -32,6 +32,7 @@
       this.watching = null; // a film of the level before
       this.level = level;
       this.ended = false;
+      this.held.clear(); // a pad that goes while it is held never says that it is released
       this.pads();
       this.clock(0);
       this.say("");

@@ -12,12 +12,20 @@ from levelproof.pipeline.look.gallery.attempts import Contender
 from levelproof.pipeline.play.server import HOST, serving
 from levelproof.pipeline.play.session import Session, empty_file
 from tests.pace import patience
-from tests.pipeline.look.test_gallery_browser import UNNAMED, chromium, patient
+from tests.pipeline.look.test_gallery_browser import PRESSED, UNNAMED, chromium, patient
 from tests.pipeline.play.test_play import QUICK, driven_by_a_thruster, random_policy
 
 __all__ = ["chromium"]  # a fixture
 pytestmark = pytest.mark.campaign
 VIEW, BORDER, TOP = 5.16, 0.08, 5.08  # m; the canvas shows -BORDER to TOP
+RECORDING = """() => {
+    const send = WebSocket.prototype.send;
+    window.asked = [];
+    WebSocket.prototype.send = function (text) {
+        asked.push(JSON.parse(text));
+        send.call(this, text);
+    };
+}"""
 
 
 @pytest.fixture
@@ -115,6 +123,60 @@ def test_delete_key_leaves_scenery_as_it_is(page: Any) -> None:
     place(page, "Circle", 1.0, 0.7, "green")  # answers come in the order of requests
     click(page, 2.5, -0.04)
     page.wait_for_selector("#what:text-is('Plain body, cannot move')")
+
+
+def wait_for_step(page: Any, step: int) -> None:
+    page.wait_for_selector(f"#clock:has-text('step {step} of')")
+
+
+def test_page_and_engine_stay_at_the_same_step(page: Any) -> None:
+    """When there is nothing to undo, and when the engine refuses an edit."""
+    for step in (1, 2):
+        button(page, "One step")
+        wait_for_step(page, step)
+    page.keyboard.press("Control+z")
+    wait_for_step(page, 2)
+    place(page, "Circle", 1.0, 0.7, "green")
+    wait_for_step(page, 0)
+    button(page, "One step")
+    wait_for_step(page, 1)
+    page.keyboard.press("Control+Shift+z")
+    button(page, "One step")
+    wait_for_step(page, 2)
+    for _ in range(16):  # the first only goes to the start, too
+        button(page, "Larger")
+    page.wait_for_selector("#problem:has-text('The body would reach')")
+    button(page, "One step")
+    wait_for_step(page, 1)
+    button(page, "Larger")
+    wait_for_step(page, 0)
+    button(page, "One step")
+    wait_for_step(page, 1)
+
+
+def test_control_held_while_the_level_changes_is_released(page: Any) -> None:
+    place(page, "Circle", 1.0, 0.7, "plain")
+    button(page, "Thruster", "radio")
+    click(page, 1.0, 0.7)
+    page.wait_for_selector("#pads button")
+    button(page, "Select", "radio")
+    click(page, 1.0, 0.9)
+    button(page, "blue")
+    page.wait_for_selector("#what:has-text('Blue')")
+    page.evaluate(RECORDING)
+    page.locator("#pads button").hover()
+    page.mouse.down()
+    page.wait_for_selector("#play:text-is('Pause')")
+    page.keyboard.press("Control+z")
+    page.wait_for_selector("#what:has-text('Plain')")
+    page.mouse.move(5, 5)  # off the button that has taken the other's place
+    page.mouse.up()
+    button(page, "One step")
+    wait_for_step(page, 1)
+    actions = [request["action"] for request in page.evaluate("asked") if request["ask"] == "step"]
+    assert (actions[0], actions[-1]) == ([0, 0, 0, 0, 1, 0], [0] * 6)
+    page.evaluate(PRESSED, {"key": "&", "code": "Digit1"})  # on a French keyboard
+    page.wait_for_selector("#pads .lit")
 
 
 def test_page_says_which_file_is_no_level(page: Any, tmp_path: Path) -> None:
