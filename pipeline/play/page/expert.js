@@ -32,6 +32,14 @@
       }
     }
 
+    // Another level is on the page: a verdict on the one before goes, an expert goes on.
+    open() {
+      if (this.running) return;
+      this.film = null;
+      at("stage-of-training").textContent = "";
+      at("learning").hidden = at("attempts").hidden = true;
+    }
+
     run(running) {
       this.running = running;
       at("train").textContent = running ? "Stop" : "Train an expert for this level";
@@ -46,8 +54,10 @@
       at("stage-of-training").textContent = STAGES[stage] ? `${STAGES[stage]}${steps}.` : "";
       if (message.curve) drawCurve(at("curve"), message.curve);
       if (stage === "done") {
-        at("stage-of-training").textContent = `${message.label}: ${message.reason} (${message.env_steps.toLocaleString("en")} env steps).`;
-        if (message.film && this.world === this.stage.world) this.solved(message.film);
+        const current = this.world === this.stage.world;
+        const note = current ? "" : " It is about the level as it was when training began.";
+        at("stage-of-training").textContent = `${message.label}: ${message.reason} (${message.env_steps.toLocaleString("en")} env steps).${note}`;
+        if (message.film && current) this.solved(message.film);
       }
       if (stage === "failed") at("stage-of-training").textContent = message.reason;
       if (["done", "stopped", "failed"].includes(stage)) this.run(false);

@@ -13,6 +13,7 @@
     stage.open(level);
     player.open(level);
     editor.open(level);
+    expert.open();
   }
 
   const player = new Player(link, stage);

@@ -215,6 +215,18 @@ def test_page_shows_training_to_its_end(page: Any, tmp_path: Path) -> None:
     done = "/^(solved|unsolved|trivial|unsolvable):/.test(document.querySelector('#stage-of-training').textContent)"
     page.wait_for_function(done, timeout=1000 * patience(240))
     assert page.locator("#learning").is_hidden() == (page.locator("#curve path").count() == 0)
+    verdict = page.locator("#stage-of-training")
+    assert "began" not in verdict.inner_text()
+    button(page, "Undo")  # the verdict is about another level now
+    page.wait_for_function("document.querySelector('#stage-of-training').textContent === ''")
+    assert page.locator("#learning").is_hidden()
+    button(page, "Redo")
+    page.wait_for_selector("#pads button")
+    button(page, "Train an expert for this level")
+    button(page, "Undo")
+    page.wait_for_function(done, timeout=1000 * patience(240))
+    assert verdict.inner_text().endswith(" It is about the level as it was when training began.")
+    assert page.locator("#watch").is_disabled()
 
 
 def test_page_shows_a_learning_curve(page: Any) -> None:
