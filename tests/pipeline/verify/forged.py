@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 from levelproof.experts.labels import Label
 from levelproof.pipeline.store.checksums import digests_of, with_own
 from levelproof.pipeline.store.formats import DIGESTS_KEY
+from levelproof.pipeline.store.layout import DATA
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.verify.verify import examine
 
@@ -27,7 +28,8 @@ def forge(split: Path, change: Callable[[Row], None] = lambda row: None, level_i
         for row in rows:
             if level_ids is None or row["level_id"] in level_ids:
                 change(row)
-        names = {row["shard"] for row in rows if row["shard"] and (split / row["shard"]).exists()}
+        named = {row["shard"] for row in rows if row["shard"] and DATA.fullmatch(row["shard"])}
+        names = {name for name in named if (split / name).exists()}
         digests = {DIGESTS_KEY: json.dumps({name: digests_of(split / name) for name in names})}
         whole = pa.BufferOutputStream()
         forged = pa.Table.from_pylist(rows, schema=table.schema.with_metadata(table.schema.metadata | digests))
