@@ -22,6 +22,7 @@ import pytest
 
 from levelproof.pipeline.errors import Failure, StoreFailure, UserError
 from levelproof.pipeline.jobs import seal as jobs_seal
+from levelproof.pipeline.jobs import unit
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import failure
 from levelproof.pipeline.store import leases, leftovers, machine, publish, remote
@@ -411,6 +412,20 @@ def test_commit_to_a_store_skips_levels_of_an_unreported_commit(server: Server, 
     assert [fragment.path.stem for fragment in manifest.fragments] == [unit_name(0, 3), unit_name(1, 2)]
     assert manifest.level_ids.tolist() == [0, 1, 2, 3]
     assert {path.relative_to(THERE).as_posix() for path in data_paths(THERE)} == manifest.shards
+
+
+def test_publishing_refuses_a_unit_that_an_earlier_commit_has_in_part(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The earlier attempt commits after this one has looked which of its levels are committed."""
+    commit_made(THERE, WorkUnit((0, 3)))
+    monkeypatch.setattr(unit, "committed_levels", lambda *_: frozenset())
+    with pytest.raises(Failure, match=r"committed first as .*, without some of the levels"):
+        commit_made(THERE, WorkUnit((0, 1, 2, 3)))
+    manifest = read_manifest(THERE)
+    assert manifest.level_ids.tolist() == [0, 3]
+    assert {path.relative_to(THERE).as_posix() for path in data_paths(THERE)} == manifest.shards
+    assert not [name for name in remote.stored_in(THERE) if name.suffix == ".begun"]
 
 
 @pytest.mark.parametrize(("first", "last"), [(4, 44), (40, None)], ids=["the first page's header", "its end"])
