@@ -5,6 +5,7 @@ import re
 import subprocess
 import tomllib
 from collections import defaultdict
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -140,16 +141,19 @@ def test_rooms_and_sources_exist() -> None:
                for name in MAY_IMPORT)  # fmt: skip
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=name_of)
-def test_imports_run_downwards(path: Path) -> None:
+def wrong_imports(path: Path) -> list[str]:
+    """Return what a file may not import."""
+    wrong = sorted(libraries(path) & {*ROOMS, *OUTSIDE})
     inner = room(".".join(["levelproof", *path.relative_to(ROOT).with_suffix("").parts]))
     assert inner
-    assert not libraries(path) & set(ROOMS), "import levelproof.<room>"
-    assert not libraries(path) & set(OUTSIDE)
     if inner == "levelproof":  # re-exports from every room
-        return
-    wrong = {outer for outer in map(room, imported(path)) if outer and not allowed(inner, outer)}
-    assert not wrong
+        return wrong
+    return wrong + sorted({outer for outer in map(room, imported(path)) if outer and not allowed(inner, outer)})
+
+
+def test_imports_run_downwards() -> None:
+    wrong = [f"{name_of(path)}: {name}" for path in SOURCES for name in wrong_imports(path)]
+    assert not wrong, "\n".join(["these files may not import:", *wrong])
 
 
 def test_wheel_and_type_checker_cover_the_product_only() -> None:
@@ -205,9 +209,17 @@ def test_class_names_are_unique() -> None:
     assert not twice
 
 
-@pytest.mark.parametrize("path", SOURCES, ids=name_of)
-def test_files_are_short_finished_and_documented(path: Path) -> None:
+def lacks(path: Path) -> Iterator[str]:
+    """Yield what is wrong with a file as a whole."""
     text = path.read_text()
-    assert len(text.splitlines()) <= MAX_LINES
-    assert not re.search(r"\b(TODO|FIXME|XXX)\b", text)
-    assert ast.get_docstring(ast.parse(text)), "a module starts with a docstring"
+    if len(text.splitlines()) > MAX_LINES:
+        yield f"it is longer than {MAX_LINES} lines"
+    if unfinished := re.search(r"\b(TODO|FIXME|XXX)\b", text):
+        yield f"it is unfinished: {unfinished[0]}"
+    if not ast.get_docstring(ast.parse(text)):
+        yield "it does not start with a docstring"
+
+
+def test_files_are_short_finished_and_documented() -> None:
+    wrong = [f"{name_of(path)}: {sentence}" for path in SOURCES for sentence in lacks(path)]
+    assert not wrong, "\n".join(wrong)
