@@ -128,14 +128,6 @@ class TestInput:
         assert main(arguments) == Exit.INPUT
         assert re.search(r"--\w+ is -?\d, but must be at least 1\.$", capsys.readouterr().err)
 
-    @pytest.mark.parametrize(
-        "arguments", [[], ["nothing"], ["physics", "--size", "xl"], ["physics", "--lanes", "many"]]
-    )
-    def test_main_rejects_unknown_arguments(self, arguments) -> None:
-        with pytest.raises(SystemExit) as error:
-            main(arguments)
-        assert error.value.code == Exit.INPUT
-
     def test_check_rejects_a_missing_level_file(self, capsys) -> None:
         assert main(["physics", "--level-file", "nowhere.npz"]) == Exit.INPUT
         assert "The file nowhere.npz does not exist" in capsys.readouterr().err

@@ -271,7 +271,6 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (["size=6-0-1-0"], "Cannot sample levels: size is 6-0-1-0: it has no room for the actuators"),
         (["size=60-2-0-1"], "Cannot sample levels: size is 60-2-0-1: a level has at most"),
         (["ppo.repeat=257"], "ppo.repeat is 257: it must be between 1 and 256"),
-        (["levels=learnabilty"], "There are no levels at learnabilty"),
         (["size=s", "levels=some/split"], "size has no effect"),
         (["where=label = 'solved'"], "where has no effect on random levels"),
         (["starts=4"], "starts has no effect on random levels"),

@@ -242,7 +242,6 @@ def test_gallery_reads_levels_block_by_block(
         module, "read_rows", lambda at, table, fields: read.append(table.num_rows) or rows(at, table, fields)
     )
     gallery(split, tmp_path / "gallery", None, MAX_LEVELS)
-    assert BLOCK == 64
     assert max(read) <= 7
     assert sum(read) == manifest.table["shard"].is_valid().to_numpy().sum()
     assert len(list((tmp_path / "gallery/data/worlds").iterdir())) == -(-PLAYED // 7)
