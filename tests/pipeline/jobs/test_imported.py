@@ -86,10 +86,9 @@ def test_import_labels_levels_by_replaying_the_actions(once: Path) -> None:
             np.testing.assert_array_equal(kept["record/action"][steps, :, 0], record.action[0, :, i])
 
 
-def test_verify_checks_every_imported_level(once: Path, folder: Path) -> None:
+def test_verify_checks_every_imported_level(once: Path) -> None:
     findings = examine(once / "data/1M/s")
     assert (findings.levels, findings.witnesses, findings.sentences) == (ROWS, findings.same_bits, [])
-    shutil.rmtree(once / "theirs.gone", ignore_errors=True)
     (once / "theirs").rename(once / "theirs.gone")
     try:
         (wrong,) = examine(once / "data/1M/s").wrong  # the unsolved level's world is stored nowhere else
@@ -180,6 +179,20 @@ def test_import_continues_after_a_stop(
     assert "1 of 2 units are already there" in done.stderr, done.stderr
     want, got = (rows_of(path / "data/1M/s") for path in (once, tmp_path))
     same = [name for name in want[0] if name not in ("shard", "command", "learning_curve")]
+    assert [[row[name] for name in same] for row in got] == [[row[name] for name in same] for row in want]
+
+
+def test_import_continues_once_a_damaged_chunk_is_mended(once: Path, tmp_path: Path) -> None:
+    theirs = Path(shutil.copytree(once / "theirs", tmp_path / "theirs"))
+    words = ["import", "theirs", "-o", "data/1M/s"]
+    (theirs / "second/0.0").write_bytes(b"")
+    done = here(words, tmp_path)
+    assert_refused(done, 1, "Cannot continue with theirs: ", "second/0.0", "then run the same command")
+    shutil.copy(once / "theirs/second/0.0", theirs / "second")
+    done = here(words, tmp_path)
+    assert "1 of 2 units are already there" in done.stderr, done.stderr
+    want, got = (rows_of(path / "data/1M/s") for path in (once, tmp_path))
+    same = [name for name in want[0] if name not in ("shard", "file", "command", "learning_curve")]
     assert [[row[name] for name in same] for row in got] == [[row[name] for name in same] for row in want]
 
 

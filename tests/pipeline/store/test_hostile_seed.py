@@ -183,6 +183,7 @@ def test_unpacking_random_bytes_gives_actions_or_one_error() -> None:
         unpacked += 1
         assert ((action >= 0) & (action < np.array(CHOICES)[:, None])).all()
     assert unpacked
+    assert refusals
     assert all(sentence.startswith("its witnesses ") for sentence in refusals)
 
 

@@ -1,6 +1,7 @@
 """Seed files: splits as ids and witnesses, read, grown and exported again without a changed bit."""
 
 import re
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +33,9 @@ from levelproof.pipeline.store.seed.packed import MAX_RUN, pack_witness, unpack_
 from levelproof.pipeline.store.seed.shard import SeedShard, play_seeds
 from levelproof.pipeline.store.seed.worlds import pack_worlds, unpack_worlds
 from levelproof.pipeline.verify.verify import examine
+from tests.pipeline.command import ROOT
 from tests.pipeline.made import assert_same, honest_split, made_level, made_split
+from tests.pipeline.verify.forged import forge, rows_labelled
 
 ALL = np.ones(len(CHOICES), bool)
 QUIET = Console(quiet=True)
@@ -78,7 +81,7 @@ def test_witnesses_unpack_to_the_actions_that_were_packed() -> None:
 
 
 def guides_decoder() -> Callable[[bytes, int], list[list[int]]]:
-    codes = re.findall(r"^```python\n(.*?)^```", Path("docs/seeds.md").read_text(), re.DOTALL | re.MULTILINE)
+    codes = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs/seeds.md").read_text(), re.DOTALL | re.MULTILINE)
     (code,) = [each for each in codes if "def actions" in each]
     names: dict[str, Any] = {}
     exec(code, names)
@@ -335,6 +338,16 @@ def test_grow_refuses_another_name_and_foreign_settings(seed: Path, tmp_path: Pa
         grow(seed, tmp_path / "128k/s", ["size=m"], QUIET)
     with pytest.raises(UserError, match="There is no seed file at"):
         grow(tmp_path / "none.parquet", tmp_path / "128k/s", INLINE, QUIET)
+
+
+def test_export_refuses_a_row_that_its_episode_belies(split: Path, tmp_path: Path) -> None:
+    forged, out = Path(shutil.copytree(split, tmp_path / "forged")), tmp_path / "no.parquet"
+    (solved, *_) = rows_labelled(forged, Label.SOLVED)
+    forge(forged, lambda row: row.update(steps_to_goal=row["steps_to_goal"] + 1), [solved["level_id"]])
+    sentence = f"The first episode of level {solved['level_id']} does not end at the goal as its row says"
+    with pytest.raises(Failure, match=sentence):
+        export_seed(forged, None, out)
+    assert not out.exists()
 
 
 def test_export_refuses_settings_that_no_seed_file_can_have(

@@ -13,8 +13,11 @@ import pytest
 from numcodecs import Blosc
 
 from levelproof.levelgen.level import SIZES
-from levelproof.pipeline.read.kinetix.folder import open_folder, read_trajectories
+from levelproof.levelgen.task.actions import CHOICES
+from levelproof.pipeline.read.kinetix.folder import Trajectories, open_folder, read_trajectories
 from levelproof.pipeline.read.kinetix.zarr2 import FormatError, StoredArray
+from levelproof.pipeline.store.contents import highest
+from levelproof.pipeline.store.fields import arrays_of
 from tests.pipeline.read.kinetix.folder import GOLDEN, OTHERS, SOLVED, to_ours, trajectories_in
 
 ONE_WAY = "its collision matrix lets a body collide with another, but not that one with it"
@@ -26,10 +29,9 @@ def theirs(tmp_path: Path) -> Path:
     return Path(shutil.copytree(GOLDEN / "s", tmp_path / "theirs"))
 
 
-def read(folder: Path) -> None:
+def read(folder: Path) -> list[Trajectories]:
     """Read everything in a folder."""
-    for array in open_folder(folder).arrays:
-        read_trajectories(array, 0, array.rows)
+    return [read_trajectories(array, 0, array.rows) for array in open_folder(folder).arrays]
 
 
 @pytest.mark.parametrize("size", ["s", "m"])
@@ -178,12 +180,31 @@ def test_open_folder_rejects_hostile_folders_in_one_sentence_and_little_memory(
 def test_read_trajectories_reports_a_flipped_byte_or_returns_checked_values(theirs: Path) -> None:
     """Blosc chunks have no checksum, so values read after a flip are checked like any untrusted ones."""
     path, rng = theirs / "first/0.0", np.random.default_rng(0)
-    raw = path.read_bytes()
-    for at in [*range(16), *rng.integers(16, len(raw), 24).tolist()]:
+    raw, refused, wrong = path.read_bytes(), 0, list[str]()
+    flips = [*range(16), *rng.integers(16, len(raw), 24).tolist()]
+    for at in flips:
         broken = bytearray(raw)
         broken[at] ^= 1 << int(rng.integers(8))
         path.write_bytes(broken)
         try:
-            read(theirs)
+            trajectories = read(theirs)
         except FormatError as error:
             assert "its chunk" in str(error)  # noqa: PT017
+            refused += 1
+            continue
+        for each in trajectories:
+            require_usable(each)
+            wrong += each.wrong
+    assert 0 < refused < len(flips)
+    assert any(wrong)
+
+
+def require_usable(trajectories: Trajectories) -> None:
+    """Check that all values of trajectories that are not reported are finite and within bounds."""
+    good = np.array([not reason for reason in trajectories.wrong])
+    action, maxima = trajectories.action[..., good], highest(SIZES["s"])
+    assert ((action >= 0) & (action < np.array(CHOICES)[:, None])).all()
+    for name, values in arrays_of(trajectories.level, "level/").items():
+        some = np.asarray(values)[..., good]
+        assert np.isfinite(some).all(), name
+        assert name not in maxima or ((some >= 0) & (some <= maxima[name])).all(), name
