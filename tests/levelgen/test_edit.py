@@ -16,6 +16,7 @@ from levelproof.levelgen.edit import (
     add_body,
     add_joint,
     add_thruster,
+    bind,
     bodies_at,
     delete,
     fix,
@@ -26,7 +27,8 @@ from levelproof.levelgen.edit import (
     turn,
 )
 from levelproof.levelgen.files.level_file import LevelFile, from_document, to_document
-from levelproof.levelgen.level import SIZES, Level, Role
+from levelproof.levelgen.frames import in_world
+from levelproof.levelgen.level import MOTOR_BINDINGS, SIZES, THRUSTER_BINDINGS, Level, Role
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.levelgen.task.rules import TaskParams, advance, reset
@@ -112,6 +114,7 @@ def test_set_role_and_fix_change_one_body() -> None:
     level = fix(set_role(joined(), FIRST, Role.GREEN), FIRST, True)
     one = one_of(level)
     assert one.role[FIRST] == Role.GREEN
+    assert one_of(set_role(empty(), 0, Role.RED)).role[0] == Role.RED  # of the scenery
     assert one.model.inverse_mass[FIRST] == 0
     assert bodies_at(level, 2.2, 2.2) == [M.polygons, FIRST]  # immovable bodies are drawn first
     assert one_of(fix(level, FIRST, False)).model.inverse_mass[FIRST] == pytest.approx(4)
@@ -126,11 +129,38 @@ def test_fixed_body_stays_where_it_is_even_if_it_moved() -> None:
     np.testing.assert_array_equal(after.rotation[FIRST], still.state.rotation[FIRST])
 
 
+def test_bind_changes_the_entry_of_one_actuator() -> None:
+    level = joined()
+    motors, thrusters = level.motor_binding.copy(), level.thruster_binding.copy()
+    motors[0], thrusters[0] = 2, 1
+    motor, thruster = bind(level, "joint", 0, MOTOR_BINDINGS + 2), bind(level, "thruster", 0, THRUSTER_BINDINGS + 1)
+    np.testing.assert_array_equal(motor.motor_binding, motors)
+    np.testing.assert_array_equal(motor.thruster_binding, level.thruster_binding)
+    np.testing.assert_array_equal(thruster.motor_binding, level.motor_binding)
+    np.testing.assert_array_equal(thruster.thruster_binding, thrusters)
+
+
+def test_fixed_joint_keeps_the_angle_between_its_bodies() -> None:
+    level = add_body(turn(add_body(empty(), "rectangle", 2.0, 2.0), FIRST, 0.4), "circle", 2.2, 2.2)
+    level = add_joint(turn(level, M.polygons, -0.5), 2.15, 2.15, True)
+    assert level.model.joint_fixed[0].all()
+    assert not level.model.motor_on[0].any()
+    after = advance(level, reset(level), np.zeros((6, 1), np.int32), TaskParams())[0].state
+    assert float(after.rotation[M.polygons, 0] - after.rotation[FIRST, 0]) == pytest.approx(-0.9, abs=1e-3)
+
+
+def test_thruster_on_a_turned_body_is_where_it_was_put() -> None:
+    one = one_of(add_thruster(turn(add_body(empty(), "rectangle", 2.0, 2.0), FIRST, 1.0), 2.1, 2.05, 0.3))
+    assert one.model.thruster_rotation[0] + one.state.rotation[FIRST] == pytest.approx(0.3)
+    assert in_world(one.state, FIRST, one.model.thruster_position[0]) == pytest.approx([2.1, 2.05])
+
+
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
         (lambda: move(empty(), 0, 1, 1), "scenery"),
         (lambda: move(empty(), FIRST, 1, 1), "no body 4"),
+        (lambda: add_body(empty(), "hexagon", 1, 1), "choose circle"),
         (lambda: add_joint(empty(), 1, 1), "two bodies"),
         (lambda: add_thruster(empty(), 1, 1, 0), "on one"),
         (lambda: resize(joined(), FIRST, 100), "would reach"),
@@ -209,6 +239,4 @@ def test_level_file_holds_the_result_of_any_edits(level_id: int, edits: list) ->
 
 
 def one_level(level_id: int) -> Level:
-    import jax
-
     return jax.tree.map(np.asarray, sample_levels([level_id], M))
