@@ -21,6 +21,7 @@ from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.evaluation import play, play_randomly, play_sampled
 from levelproof.experts.imitation import ImitationConfig, compare, from_motion
 from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind
+from levelproof.experts.networks.saved import save_policy
 from levelproof.experts.witness.witness import replay, steps_to_goal
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.mirror import mirror
@@ -227,6 +228,14 @@ def test_a_stopped_run_does_not_read_the_levels_of_the_next_pool(split: Path, mo
     going_on.set()
     closing.join()
     assert len(read) < feed.levels, "not all of them"
+
+
+def test_policy_that_no_run_has_made_is_not_overwritten(split: Path, tmp_path: Path) -> None:
+    save_policy(tmp_path / "policy", levelproof.load_policy("builtin:s"))
+    files = {path: path.read_bytes() for path in (tmp_path / "policy").iterdir()}
+    done = here(["clone", str(split), "-o", "policy"], tmp_path)
+    assert_refused(done, 2, "policy has a policy already: choose another folder with -o.")
+    assert {path: path.read_bytes() for path in files} == files
 
 
 def test_bad_input_is_refused(split: Path, policy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

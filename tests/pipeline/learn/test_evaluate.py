@@ -1,6 +1,7 @@
 """The command that measures policies, on the shared split, level files and sealed levels."""
 
 import errno
+import io
 import json
 import os
 import re
@@ -12,6 +13,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from rich.console import Console
 
 import levelproof
 from benchmarks.published import write as write_published
@@ -281,6 +283,31 @@ def test_linked_log_of_looks_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / LOOKS).symlink_to(tmp_path / "published")
     assert log_look(tmp_path / LOOKS, "policy", [], 1, 0) is None
     assert not (tmp_path / "published").read_text()
+
+
+def test_look_is_logged_on_a_line_of_its_own_after_one_that_was_cut_off(tmp_path: Path) -> None:
+    (tmp_path / LOOKS).write_text('{"at": "2026-')
+    assert [log_look(tmp_path / LOOKS, "policy", [], 1, seed) for seed in (7, 8)] == [2, 3]
+    cut_off, *looks = (tmp_path / LOOKS).read_text().splitlines()
+    assert cut_off == '{"at": "2026-'
+    assert [json.loads(look)["seed"] for look in looks] == [7, 8]
+
+
+def test_look_that_cannot_be_logged_is_told_unless_the_policy_comes_with_levelproof(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("agent.py").write_text("def act(seen, live, uniform): return uniform")
+    Path(f"agent.{LOOKS}").mkdir()
+    said = {}
+    for name in ("agent.py", "builtin:s"):
+        console = Console(file=io.StringIO(), width=200)
+        evaluate._log(evaluate._contestant(Path(name), "policy"), [], 1, 0, console)
+        said[name] = console.file.getvalue()
+    assert said == {
+        "agent.py": f"Cannot write agent.{LOOKS}, so this evaluation is not recorded.\n",
+        "builtin:s": "",
+    }
 
 
 @pytest.mark.slow

@@ -16,7 +16,11 @@ from levelproof.configs.train import TrainConfig
 from levelproof.experts.generalist.config import EvolveConfig, LearnabilityConfig, PPOConfig, ReplayConfig
 from levelproof.experts.generalist.train import _programs as programs
 from levelproof.experts.networks.saved import Policy, policy_folder
+from levelproof.levelgen.files.level_file import LevelFile, write_level_file
+from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.levelgen.task.lanes import FIRST_EXTRA
+from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.exchange.level_json import export
 from levelproof.pipeline.learn import run as writer
 from levelproof.pipeline.learn import sealed
@@ -252,6 +256,12 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     of_files = levels_for(TrainConfig(levels=str(tmp_path)), messages.append)
     assert of_files.facts["count"] == 1
     assert not messages
+    (tmp_path / "two").mkdir()
+    shutil.copy(tmp_path / "level.json", tmp_path / "two")
+    write_level_file(LevelFile(empty_level(SIZES["m"], 1), DEFAULT_RULES), tmp_path / "two/m.json")
+    with pytest.raises(levelproof.UserError, match=r"levels of the sizes [sm], [sm]: train on files of one size"):
+        levels_for(TrainConfig(levels=str(tmp_path / "two")), print)
+    shutil.rmtree(tmp_path / "two")
     first = ids[0]
     monkeypatch.setattr(sealed, "SEALED", range(first, first + 2))
     with pytest.raises(levelproof.UserError, match=f'sealed to measure policies.*where="level_id < {first}"'):
@@ -261,6 +271,45 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(sealed, "sealed_hashes", lambda: frozenset(data.content_hashes))
     with pytest.raises(levelproof.UserError, match="only copies of sealed levels"):
         levels_for(TrainConfig(levels=str(tmp_path)), print)  # their content, whatever their ids
+
+
+@pytest.mark.parametrize(
+    ("noted", "asked", "own", "backend", "cores", "prepared"),
+    [
+        (2, 0, 4, "cpu", 2, 2),
+        (2, 4, 4, "cpu", 2, 2),
+        (0, 0, 4, "cpu", 4, 4),
+        (0, 0, 7, "cpu", 4, 4),
+        (0, 0, 3, "cpu", 2, 2),
+        (0, 0, 9, "cpu", 4, 8),  # JAX was set up for fewer before
+        (0, 1, 4, "cpu", 1, 1),
+        (3, 0, 4, "cpu", 4, 4),
+        (3, 2, 4, "cpu", 2, 2),
+        (0, 4, 4, "gpu", 1, 4),
+    ],
+)
+def test_resumed_run_keeps_its_cores_and_a_new_one_takes_what_divides_its_lanes(
+    noted: int, asked: int, own: int, backend: str, cores: int, prepared: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = list[int]()
+    monkeypatch.setattr(module, "prepare_jax", lambda devices: told.append(devices))
+    monkeypatch.setattr(module, "own_cores", lambda: range(own))
+    monkeypatch.setattr(module.jax, "devices", lambda: range(4))
+    monkeypatch.setattr(module.jax, "default_backend", lambda: backend)
+    note = {"cores": noted} if noted else None
+    assert module.prepared_cores(TrainConfig(cores=asked), note) == cores
+    assert told == [prepared]
+
+
+def test_cores_for_which_jax_has_too_few_devices_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "prepare_jax", lambda devices: None)
+    monkeypatch.setattr(module.jax, "devices", lambda: range(1))
+    monkeypatch.setattr(module.jax, "default_backend", lambda: "cpu")
+    for noted, asked in ((0, 3), (2, 0)):
+        with pytest.raises(
+            levelproof.UserError, match=f"cores is {noted or asked}, .*for 1 in this process: set cores=1"
+        ):
+            module.prepared_cores(TrainConfig(cores=asked), {"cores": noted})
 
 
 @pytest.mark.parametrize(
