@@ -25,6 +25,8 @@ jax.devices()  # one, from here on: else a test that trains first would give lat
 # Ray starts workers with a niceness of 15: beside two tests that compute they get 4% of the machine, so that their
 # tests would wait for others to end, not for a defect.
 os.environ.setdefault("RAY_worker_niceness", "0")
+# Tests start a Ray of their own, or name another.
+os.environ.pop("RAY_ADDRESS", None)
 # Commands that tests start would compile all of Python's sources, every time.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # A local Ray makes its process ask for tokens, and so all that the process starts later. A command that asks for them

@@ -54,11 +54,11 @@ def test_cache_folder_rejects_another_users_folder(tmp_path: Path, monkeypatch: 
     cache_folder()
     owner = tmp_path.stat().st_uid
     monkeypatch.setattr(os, "getuid", lambda: owner + 1)
-    if owner:
-        with pytest.raises(UserError, match="belongs to another user"):
-            cache_folder()
-    else:
+    if not owner:
         cache_folder()  # root's folders are accepted, because root can write anywhere
+        os.chown(tmp_path, 12345, -1)
+    with pytest.raises(UserError, match="belongs to another user"):
+        cache_folder()
 
 
 def test_experts_that_others_can_write_to_are_rejected(tmp_path: Path) -> None:

@@ -69,7 +69,6 @@ def test_second_signal_interrupts_a_heeded_block() -> None:
 
 
 @pytest.mark.campaign
-@pytest.mark.slow
 def test_driver_cancels_rounds_to_stop(tmp_path: Path) -> None:
     """Otherwise a worker would learn of the stop only at the end of its round."""
     alone = ("search.env_steps=0", "stop.rule=budget")  # so that experts train long

@@ -4,8 +4,8 @@ import pytest
 
 from levelproof.configs.compose import compose_job
 from levelproof.configs.schema import GrowConfig
-from levelproof.pipeline.jobs.choice import MANY, MAX_THREADS, most_workers, runs_here, workers_here
-from levelproof.pipeline.runtime import own_cores
+from levelproof.pipeline.jobs import choice
+from levelproof.pipeline.jobs.choice import most_workers, runs_here, workers_here
 from tests.pipeline.made import made_job
 
 HERE, ON_RAY = "executor=inline", "executor=ray"
@@ -49,7 +49,6 @@ def test_job_that_asks_for_workers_runs_on_ray(word: str) -> None:
 
 def test_job_runs_on_the_cluster_that_the_environment_names(monkeypatch: pytest.MonkeyPatch) -> None:
     job = made_job("data", "executor=auto")
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
     assert runs_here(job, 1)
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:9")
     assert not runs_here(job, 1)
@@ -57,11 +56,19 @@ def test_job_runs_on_the_cluster_that_the_environment_names(monkeypatch: pytest.
 
 
 @pytest.mark.parametrize(
-    ("words", "levels", "most"),
-    [((), 64, MAX_THREADS), (("workers=1",), 64, 1), (("device=gpu",), 64, 1), ((), 2 * MANY - 1, 1), ((), 1, 1)],
+    ("words", "cores", "levels", "workers"),
+    [
+        ((), 32, 1000, 6),
+        ((), 32, 64, 4),
+        ((), 2, 1000, 2),
+        ((), 32, 31, 1),
+        ((), 32, 1, 1),
+        (("workers=3",), 32, 1000, 3),
+        (("device=gpu",), 32, 1000, 1),
+    ],
 )
 def test_job_of_this_process_has_a_worker_for_each_core_that_it_can_fill(
-    words: tuple[str, ...], levels: int, most: int
+    words: tuple[str, ...], cores: int, levels: int, workers: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    expected = min(len(own_cores()), most, max(1, levels // MANY))
-    assert workers_here(made_job("data", HERE, *words), levels) == expected
+    monkeypatch.setattr(choice, "own_cores", lambda: range(cores))
+    assert workers_here(made_job("data", HERE, *words), levels) == workers

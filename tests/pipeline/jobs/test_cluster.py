@@ -44,7 +44,6 @@ def fragile(deadly: int, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.campaign
-@pytest.mark.slow
 def test_level_that_kills_its_worker_is_quarantined_alone(tmp_path: Path) -> None:
     done = fragile(DEADLY, tmp_path)
     assert done.returncode == 3, done.stderr
@@ -62,7 +61,6 @@ def test_level_that_kills_its_worker_is_quarantined_alone(tmp_path: Path) -> Non
 
 
 @pytest.mark.campaign
-@pytest.mark.slow
 def test_run_fails_if_no_worker_can_start(tmp_path: Path) -> None:
     done = fragile(-1, tmp_path)
     assert_refused(done, 1, "No worker can start (The worker died", "try executor=inline")
@@ -87,7 +85,6 @@ def test_connected_explains_a_ray_that_starts_too_slowly(kind: type, monkeypatch
     def init(**_: Any) -> None:
         raise kind("The current node timed out during startup. This could happen because some of the raylet failed.")
 
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setattr(cluster.ray, "init", init)
     sentence = r"cannot start \(The current node timed out .*is less busy, .*=inline\.$"
     with pytest.raises(Failure, match=sentence), cluster.connected():
@@ -102,7 +99,6 @@ def test_connected_explains_a_cluster_of_other_versions(monkeypatch: pytest.Monk
             f"with:\n{ours}\n"
         )
 
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setattr(cluster.ray, "init", init)
     sentence = r"another Ray or Python than this command \(The cluster .* Ray: 2\.40\.0 .* Python: 3\.11\.7\): install"
     with pytest.raises(UserError, match=sentence), cluster.connected():
@@ -111,7 +107,6 @@ def test_connected_explains_a_cluster_of_other_versions(monkeypatch: pytest.Monk
 
 @pytest.mark.campaign
 def test_workers_do_without_a_gpu_that_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
     monkeypatch.setenv("RAY_OVERRIDE_RESOURCES", '{"GPU": 1}')
     monkeypatch.setenv("RAY_raylet_start_wait_time_s", str(int(patience(COMMAND_SECONDS))))
     before = ray_constants.ENABLE_RAY_CLUSTER
@@ -149,8 +144,7 @@ def test_require_reachable_names_an_invalid_address(address: str, monkeypatch: p
 
 def python(program: str, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
     """Run a program that starts a local Ray."""
-    environment = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}
-    environment |= {"RAY_raylet_start_wait_time_s": str(int(patience(COMMAND_SECONDS)))} | variables
+    environment = os.environ | {"RAY_raylet_start_wait_time_s": str(int(patience(COMMAND_SECONDS)))} | variables
     command = [sys.executable, "-c", program, *arguments]
     return subprocess.run(
         command,
@@ -208,7 +202,6 @@ with only_writer(split, print):
 
 
 @pytest.mark.campaign
-@pytest.mark.slow
 def test_late_worker_commits_only_for_its_own_driver(tmp_path: Path) -> None:
     split = tmp_path / SPLIT
     split.mkdir(parents=True)
@@ -383,7 +376,6 @@ def machines() -> Iterator[Any]:
 
 
 @pytest.mark.campaign
-@pytest.mark.slow
 def test_run_survives_machines_that_join_and_leave(tmp_path: Path, machines: Any) -> None:
     """Start a head without a core; add a node to the waiting run, add another, then remove the first.
 
@@ -420,7 +412,6 @@ def test_run_survives_machines_that_join_and_leave(tmp_path: Path, machines: Any
 
 
 @pytest.mark.campaign
-@pytest.mark.slow
 def test_ray_exports_progress_to_prometheus(tmp_path: Path) -> None:
     pytest.importorskip("aiohttp", reason="needs ray[default], which exports metrics to Prometheus")
     from ray.cluster_utils import Cluster
@@ -453,7 +444,6 @@ def test_ray_exports_progress_to_prometheus(tmp_path: Path) -> None:
 
 
 @pytest.mark.campaign
-@pytest.mark.slow
 def test_crew_replaces_a_stalled_worker(tmp_path: Path) -> None:
     alone = ("search.env_steps=0", "stop.rule=budget")  # so that experts train long
     command = ["generate", f"levels={LEVELS}", "unit=1", "budget=1M", "workers=1", "executor=ray", *alone]
@@ -469,7 +459,6 @@ def test_crew_replaces_a_stalled_worker(tmp_path: Path) -> None:
 
 
 @pytest.mark.campaign
-@pytest.mark.slow
 def test_lost_machines_and_a_restarted_driver_change_no_bit(tmp_path: Path, machines: Any) -> None:
     command = ["generate", "levels=24", "unit=2", "budget=5k"]
     first = machines.add_node(num_cpus=1, **MEMORY)

@@ -99,8 +99,7 @@ def test_bytes_of_worker_grow_with_the_size() -> None:
 @pytest.mark.campaign
 def test_crew_does_not_wait_for_a_gpu_that_others_hold() -> None:
     command = [sys.executable, "-c", HELD]
-    environment = {name: value for name, value in os.environ.items() if name != "RAY_ADDRESS"}
-    environment |= {
+    environment = os.environ | {
         "PYTHONPATH": str(ROOT),
         "RAY_USAGE_STATS_ENABLED": "0",
         "RAY_raylet_start_wait_time_s": str(int(patience(COMMAND_SECONDS))),

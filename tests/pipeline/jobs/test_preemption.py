@@ -21,7 +21,7 @@ SETTINGS = [f"levels={LEVELS}", f"unit={LEVELS}", "budget=256k", *ALONE]
 COMMAND = ["generate", *SETTINGS, "workers=1", "checkpoint=1s"]
 SPLIT = Path("data/256k/s")
 
-pytestmark = [pytest.mark.campaign, pytest.mark.slow]
+pytestmark = pytest.mark.campaign
 
 
 @pytest.fixture(scope="module")

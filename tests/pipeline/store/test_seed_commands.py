@@ -81,6 +81,16 @@ def test_seal_to_density_seed_writes_the_file_that_export_writes(split: Path, se
     assert_refused(here(words, tmp_path), 2, "levels.parquet already exists")
 
 
+def test_commands_that_write_leave_a_folder_of_seed_files_as_it_is(seed: Path, tmp_path: Path) -> None:
+    whole, folder = seed.read_bytes(), seed.parent
+    words = ["generate", f"out={folder.parents[1]}", "levels=1", "executor=inline"]
+    for command in (["seal", str(seed)], ["seal", str(folder)], words):
+        done = here(command, tmp_path)
+        assert_refused(done, 2, "has seed files, which no command changes", "`levelproof grow`")
+    assert [*folder.iterdir()] == [seed]
+    assert seed.read_bytes() == whole
+
+
 def test_verify_finds_no_fault_in_a_seed_file_and_every_change_of_its_bytes(seed: Path, tmp_path: Path) -> None:
     findings = examine(seed)
     assert (findings.wrong, findings.levels) == ({}, 16)
@@ -284,7 +294,6 @@ def test_seed_file_at_the_root_of_a_store_opens(seed: Path, tmp_path: Path, monk
 
 
 @pytest.mark.campaign
-@pytest.mark.slow
 def test_ray_workers_grow_what_one_process_grows(seed: Path, tmp_path: Path) -> None:
     for folder, *words in (["ray", "executor=ray", "workers=2"], ["inline", INLINE]):
         done = run(["grow", str(seed), "-o", f"{folder}/128k/s", *words], tmp_path)
