@@ -12,11 +12,15 @@ import pytest
 
 from tests import pace
 from tests.pace import patience, wait_until
+from tests.pipeline import command
+from tests.pipeline.command import line_of
 
 TESTS = Path(__file__).parent
 ROOT = TESTS.parent
 WAITS = ("wait", "settimeout", "wait_for_timeout")  # methods whose first argument is a limit
+LIMITING = (Path(pace.__file__), Path(command.__file__))  # one measures how long a process takes, one reads in a thread
 RUNS = ("run", "call", "check_call", "check_output")  # functions of subprocess that wait for ever without one
+ENDLESS = ("readline", "join")  # methods, of a process's output and of a thread, that without arguments wait for ever
 
 
 def test_patience_grows_with_the_slowness_and_never_shrinks(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -51,15 +55,14 @@ def test_measured_slowness_counts_time_that_other_processes_take() -> None:
         "begin = time.process_time()\nwall = pace.timed(pace.compute)\nprint(wall, time.process_time() - begin)"
     )
     process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
+    assert line_of(process, process.stdout) == "ready\n"
     while process.poll() is None:
         os.kill(process.pid, signal.SIGSTOP)
         time.sleep(0.04)
         os.kill(process.pid, signal.SIGCONT)
         time.sleep(0.005)
-    wall, own = map(float, process.stdout.read().split())
-    process.stdout.close()
+    out, _ = process.communicate(timeout=patience(60))
+    wall, own = map(float, out.split())
     assert wall > 2 * own
 
 
@@ -81,6 +84,12 @@ def waits_for_ever(node: ast.AST) -> bool:
     match node:
         case ast.Call(ast.Attribute(ast.Name("subprocess"), name), keywords=keywords) if name in RUNS:
             return not {keyword.arg for keyword in keywords} & {"timeout", None}
+        case ast.Call(ast.Attribute(attr="urlopen") | ast.Name("urlopen"), keywords=keywords):
+            return not {keyword.arg for keyword in keywords} & {"timeout", None}
+        case ast.Call(ast.Name("connect"), keywords=keywords):  # of websockets, whose own limit does not scale
+            return not {keyword.arg for keyword in keywords} & {"open_timeout", None}
+        case ast.Call(ast.Attribute(attr=name), [], []) if name in ENDLESS:
+            return True
     return False
 
 
@@ -100,11 +109,31 @@ def test_every_wait_in_tests_has_a_limit_that_scales() -> None:
     assert not bare, "\n".join(["pass these limits through tests.pace.patience:", *bare])
 
 
-def test_every_process_that_a_test_runs_has_a_limit() -> None:
+@pytest.mark.parametrize(
+    ("code", "endless"),
+    [
+        ("subprocess.run(['true'])", True),
+        ("subprocess.run(['true'], timeout=limit)", False),
+        ("urlopen(address)", True),
+        ("urllib.request.urlopen(address)", True),
+        ("urlopen(address, timeout=limit)", False),
+        ("connect(address, max_size=9)", True),
+        ("connect(address, open_timeout=limit)", False),
+        ("process.stdout.readline()", True),
+        ("thread.join()", True),
+        ("thread.join(limit)", False),
+        ("', '.join(words)", False),
+    ],
+)
+def test_waits_for_ever_finds_calls_without_a_limit(code: str, endless: bool) -> None:
+    assert waits_for_ever(ast.parse(code, mode="eval").body) == endless
+
+
+def test_no_test_waits_for_ever() -> None:
     endless = [
         f"{path.relative_to(ROOT)}:{node.lineno}"
         for path in TESTS.rglob("*.py")
         for node in ast.walk(ast.parse(path.read_text()))
-        if waits_for_ever(node) and path != Path(pace.__file__)  # which measures how long a process takes
+        if waits_for_ever(node) and path not in LIMITING
     ]
     assert not endless, "\n".join(["give these a timeout:", *endless])

@@ -9,7 +9,8 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from threading import Thread
+from typing import IO, Any, TypeVar
 from unittest.mock import patch
 
 from levelproof.pipeline.cli.main import main
@@ -86,6 +87,19 @@ def until(condition: Callable[[], T], process: subprocess.Popen[str]) -> T:
     except AssertionError as error:
         process.kill()
         raise AssertionError(f"{error}; it wrote {process.communicate()}") from None
+
+
+def line_of(process: subprocess.Popen[str], stream: IO[str] | None) -> str:
+    """Return the next line that a process writes to `stream`; if it writes none, fail with its other output."""
+    assert stream is not None
+    lines = list[str]()
+    reader = Thread(target=lambda: lines.append(stream.readline()), daemon=True)
+    reader.start()
+    reader.join(patience(COMMAND_SECONDS))
+    if not any(lines):
+        process.kill()
+        raise AssertionError(f"{process.args} wrote no line, but {process.communicate(timeout=patience(60))}")
+    return lines[0]
 
 
 def wait_for_child(child: int) -> int:

@@ -10,7 +10,7 @@ import pytest
 
 from levelproof.pipeline.claims import claimed, try_claim
 from tests.pace import patience
-from tests.pipeline.command import ROOT
+from tests.pipeline.command import ROOT, line_of
 
 # Both processes start to compile at the same time; compiling takes about a second
 COMPILE = """
@@ -60,10 +60,9 @@ def test_two_processes_compile_a_program_once(tmp_path: Path) -> None:
 def test_claim_of_a_killed_process_is_free(tmp_path: Path) -> None:
     path = tmp_path / "program.claim"
     holder = subprocess.Popen(
-        [sys.executable, "-c", HOLD, path], env={"PYTHONPATH": str(ROOT), "PATH": ""}, stdout=subprocess.PIPE
+        [sys.executable, "-c", HOLD, path], env={"PYTHONPATH": str(ROOT), "PATH": ""}, stdout=subprocess.PIPE, text=True
     )
-    assert holder.stdout
-    holder.stdout.readline()
+    assert line_of(holder, holder.stdout) == "held\n"
     assert try_claim(path) is None
     holder.send_signal(signal.SIGKILL)
     holder.communicate()

@@ -12,7 +12,7 @@ from levelproof.pipeline import runtime
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.runtime import CACHE_VARIABLE, XLA_FLAGS, cache_folder, in_another_process, own_cores
 from tests.pace import patience
-from tests.pipeline.command import ROOT
+from tests.pipeline.command import ROOT, line_of
 
 # Orthogonal weights of several layers for several experts: batched QR factorisations in one program
 FACTORISE = """
@@ -133,14 +133,13 @@ def test_own_core_gives_each_worker_another_core(tmp_path: Path) -> None:
         text=True,
     )
     with start() as one, start() as two, start() as three:
-        cores = sorted(each.stdout.readline().strip() for each in (one, two, three) if each.stdout)
+        cores = sorted(line_of(each, each.stdout).strip() for each in (one, two, three))
         assert cores == ["5", "7", "None"]
         one.kill()
         two.kill()
         three.kill()
     with start() as again:
-        assert again.stdout
-        assert again.stdout.readline().strip() == "5"
+        assert line_of(again, again.stdout).strip() == "5"
         again.kill()
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from levelproof.pipeline.stopping import GRACE, HASTE, stoppable
 from tests.pace import patience
-from tests.pipeline.command import COMMAND_SECONDS, descendants, start, title, until
+from tests.pipeline.command import COMMAND_SECONDS, descendants, line_of, start, title, until
 from tests.pipeline.slow_seal import HUNG
 
 BOTH = (signal.SIGTERM, signal.SIGINT)
@@ -23,8 +23,7 @@ def send(number: signal.Signals) -> None:
 @pytest.mark.parametrize("beside", ["1", "0"])
 def test_sigterm_ends_a_job_whose_seal_hangs(tmp_path: Path, beside: str) -> None:
     process = start([str(tmp_path), "1", beside], tmp_path, module="tests.pipeline.slow_seal")
-    assert process.stdout
-    assert process.stdout.readline() == f"{HUNG}\n", process.communicate()
+    assert line_of(process, process.stdout) == f"{HUNG}\n"
     process.terminate()
     try:
         _, err = process.communicate(timeout=patience(COMMAND_SECONDS / 10))

@@ -17,6 +17,7 @@ from levelproof.physics.codegen.rounding import set_mode
 from levelproof.physics.step import kernel_of
 from levelproof.physics.types import Params
 from tests import arm
+from tests.pace import patience
 from tests.physics.codegen.kernels import Kernel
 from tests.physics.worlds import ROOM
 
@@ -58,7 +59,7 @@ def test_kernel_takes_subnormal_numbers_as_zeros_on_every_thread(call: Callable[
     results = [call()]
     thread = threading.Thread(target=lambda: results.append(call()))
     thread.start()
-    thread.join()
+    thread.join(patience(60))
     np.testing.assert_array_equal(np.stack(results), np.zeros((2, *X.shape), np.float32))
 
 

@@ -226,7 +226,8 @@ def test_a_stopped_run_does_not_read_the_levels_of_the_next_pool(split: Path, mo
     closing.start()
     sleep(0.5)  # it waits for the read under way
     going_on.set()
-    closing.join()
+    closing.join(patience(60))
+    assert not closing.is_alive()
     assert len(read) < feed.levels, "not all of them"
 
 

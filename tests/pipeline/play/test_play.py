@@ -36,7 +36,7 @@ from levelproof.pipeline.play.session import Session, empty_file
 from levelproof.pipeline.store.manifest import require_manifest
 from tests.experts.small import untouched
 from tests.pace import patience
-from tests.pipeline.command import assert_refused, heed_ctrl_c, here, start
+from tests.pipeline.command import assert_refused, heed_ctrl_c, here, line_of, start
 
 ANSWER_SECONDS = 120  # s; limit for an answer
 QUICK = replace(untouched(StopConfig()), search=SearchConfig(env_steps=65_536))
@@ -54,9 +54,14 @@ def address(split: Path) -> Iterator[str]:
 
 @pytest.fixture
 def page(address: str) -> Iterator[ClientConnection]:
-    limits = {"max_size": 2**26, "open_timeout": patience(10)}
-    with connect(f"{address.replace('http', 'ws')}/socket", origin=address, **limits) as connection:  # pyright: ignore[reportArgumentType]
+    with connected(address) as connection:
         yield connection
+
+
+def connected(address: str, origin: str = "") -> ClientConnection:
+    """Connect to the server at this address, from a page of `origin`, by default its own."""
+    there, own = f"{address.replace('http', 'ws')}/socket", Origin(origin or address)
+    return connect(there, origin=own, max_size=2**26, open_timeout=patience(10))
 
 
 def random_policy(size: Size | None) -> Policy:
@@ -79,11 +84,10 @@ def test_command_serves_a_level_until_ctrl_c(split: Path, tmp_path: Path) -> Non
     words = ["play", str(split), str(data.manifest["level_id"][0].as_py()), "--no-browser", "--port", "0"]
     process = start(words, tmp_path, preexec_fn=heed_ctrl_c)
     try:
-        assert process.stdout is not None
-        line = process.stdout.readline()
+        line = line_of(process, process.stdout)
         found = re.search(r"http://\S+:\d+", line)
-        assert found, (line, process.communicate())
-        with connect(f"{found[0].replace('http', 'ws')}/socket", origin=Origin(found[0]), max_size=2**26) as page:
+        assert found, line
+        with connected(found[0]) as page:
             assert ask(page, "play")["actions"] == witness.tolist()
             assert ask(page, "attempt")["actions"], "by the policy that comes with levelproof"
             process.send_signal(signal.SIGINT)  # while the page is open
@@ -188,13 +192,13 @@ def test_page_without_a_policy_for_its_level_says_so(contender: str | None) -> N
 
 def test_server_refuses_other_origins_and_hosts(address: str) -> None:
     with pytest.raises(InvalidStatus, match="403"):
-        connect(f"{address.replace('http', 'ws')}/socket", origin="http://example.com")  # pyright: ignore[reportArgumentType]
+        connected(address, origin="http://example.com")
     for path, host in (("/", "example.com"), ("/../session.py", ""), ("/nothing", "")):
         request = urllib.request.Request(address + path, headers={"Host": host} if host else {})
         with pytest.raises(urllib.error.HTTPError):
-            urllib.request.urlopen(request)
+            urllib.request.urlopen(request, timeout=patience(10))
     for path in ("/", "/draw.js", "/curve.js", "/focus.js", "/palette.css", "/main.js"):
-        assert urllib.request.urlopen(address + path).read()
+        assert urllib.request.urlopen(address + path, timeout=patience(10)).read()
 
 
 def test_play_refuses_unplayable_arguments(split: Path, tmp_path: Path, address: str) -> None:

@@ -30,7 +30,7 @@ from levelproof.pipeline.store.locks import (
 )
 from levelproof.pipeline.store.split import writing
 from tests.pace import patience
-from tests.pipeline.command import ROOT, heed_ctrl_c, start
+from tests.pipeline.command import ROOT, heed_ctrl_c, line_of, start
 from tests.pipeline.made import made_job
 
 
@@ -89,8 +89,7 @@ with getattr(locks, sys.argv[1])(*[pathlib.Path(sys.argv[2]), print][: 1 + (sys.
 def held_elsewhere(lock: str, split: Path) -> Iterator[subprocess.Popen[str]]:
     program = [sys.executable, "-c", HOLDER, lock, str(split)]
     with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT) as holder:
-        assert holder.stdout is not None
-        assert holder.stdout.readline() == "held\n"
+        assert line_of(holder, holder.stdout) == "held\n"
         yield holder
 
 
@@ -154,8 +153,7 @@ def test_without_commits_reports_its_wait_and_can_be_stopped(tmp_path: Path) -> 
     split.mkdir(parents=True)
     with committing(split):
         process = start(["generate", "budget=5k", "executor=inline"], tmp_path, preexec_fn=heed_ctrl_c)
-        assert process.stderr is not None
-        message = process.stderr.readline()
+        message = line_of(process, process.stderr)
         assert "Waiting for a worker of an earlier run" in message
         assert f"data/5k/s/{COMMIT_LOCK}" in message
         assert "fuser" in message

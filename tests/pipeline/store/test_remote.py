@@ -35,7 +35,7 @@ from levelproof.pipeline.store.layout import FRAGMENT, MANIFEST, WRITER_LOCK, en
 from levelproof.pipeline.store.leases import is_leased
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, require_manifest
 from tests.pace import patience
-from tests.pipeline.command import ROOT, assert_refused
+from tests.pipeline.command import ROOT, assert_refused, line_of
 from tests.pipeline.command import here as command
 from tests.pipeline.made import made_job, made_split, played_split
 from tests.pipeline.servers import (
@@ -376,9 +376,7 @@ def test_processes_share_a_cache_and_survive_kills(bucket: Bucket, split: Path) 
     bucket.server.spoil(5)
     for delay in (0.0, 0.05):
         processes = [begin("s3://bucket/data/s") for _ in range(3)]
-        stdout = processes[0].stdout
-        assert stdout
-        assert stdout.readline() == "ready\n"
+        assert line_of(processes[0], processes[0].stdout) == "ready\n"
         time.sleep(delay)
         processes[0].kill()
         processes[0].communicate()

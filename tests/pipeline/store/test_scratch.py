@@ -19,7 +19,7 @@ from levelproof.pipeline.store import scratch as module
 from levelproof.pipeline.store.created import new_folder
 from levelproof.pipeline.store.scratch import FILES, LOCK, PREFIX, scratch
 from tests.pace import patience
-from tests.pipeline.command import COMMAND_SECONDS, ROOT
+from tests.pipeline.command import COMMAND_SECONDS, ROOT, line_of
 
 PUBLISH = """
 from pathlib import Path
@@ -61,9 +61,8 @@ def process(program: str, temporary: Path, *arguments: str) -> Iterator[tuple[su
         command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as running:
         try:
-            assert running.stdout
-            made = Path(running.stdout.readline().strip())
-            assert made.is_dir(), running.stderr and running.stderr.read()
+            made = Path(line_of(running, running.stdout).strip())
+            assert made.is_dir()
             yield running, made
         finally:
             running.kill()
