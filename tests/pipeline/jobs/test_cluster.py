@@ -1,5 +1,6 @@
 """Workers that die and clusters that grow and shrink, mostly on real Ray: every level that can be made is made."""
 
+import io
 import os
 import re
 import shutil
@@ -11,11 +12,13 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.request import urlopen
 
 import pytest
 from ray._private import ray_constants
+from ray.exceptions import ActorUnavailableError, RayError
 from rich.console import Console
 
 from levelproof.pipeline.errors import Failure, UserError
@@ -28,7 +31,7 @@ from levelproof.pipeline.store.layout import JOB
 from levelproof.pipeline.store.leases import served
 from levelproof.pipeline.store.locks import only_writer
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
-from tests.pace import patience
+from tests.pace import patience, wait_until
 from tests.pipeline.command import COMMAND_SECONDS, ROOT, assert_refused, descendants, run, start, title, until
 from tests.pipeline.made import lasting, made_job
 
@@ -130,8 +133,7 @@ def test_slow_starts_are_noticed(capsys: pytest.CaptureFixture[str], monkeypatch
     with noticing_slow_starts(60):
         pass
     with noticing_slow_starts(0.01):
-        time.sleep(0.5)
-    (line,) = capsys.readouterr().err.splitlines()
+        (line,) = wait_until(lambda: capsys.readouterr().err.splitlines(), 60, "no notice")
     assert line.startswith("Still waiting for the cluster at RAY_ADDRESS=192.0.2.7:6379 to answer")
 
 
@@ -317,22 +319,86 @@ def test_crew_hands_on_the_units_of_workers_on_a_refused_machine(monkeypatch: py
     assert [*scheduler.workers] == [elsewhere]
 
 
+def crew_of(monkeypatch: pytest.MonkeyPatch, handles: list[cluster.WorkerHandle]) -> tuple[cluster.Crew, io.StringIO]:
+    """Return a crew of these workers, and what it says; units of one level wait for each that is up."""
+    monkeypatch.setattr(cluster.ray, "cluster_resources", dict)
+    monkeypatch.setattr(cluster.ray, "kill", lambda actor: None)
+    monkeypatch.setattr(cluster, "_machines", lambda: {"a": {}, "b": {}})
+    said, scheduler = io.StringIO(), Scheduler([WorkUnit((0,)), WorkUnit((1,))], 2)
+    crew = cluster.Crew(made_job("data", "unit=1"), SPLIT, scheduler, Board(Tally(2, 0, 0), Console(file=said)))
+    crew._handles = handles
+    for handle in handles:
+        if handle.up:
+            scheduler.join(handle, 0.0)
+            scheduler.order(handle, 0.0)
+    return crew, said
+
+
+def test_crew_gives_up_workers_that_cannot_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = (cluster.WorkerHandle(node, node) for node in "ab")
+    crew, said = crew_of(monkeypatch, [first, second])
+    for _ in range(cluster.STARTS):
+        assert crew._handles == [first, second]
+        assert crew._lose(first, "a traceback", "The worker died: no room") == []
+        crew._give_up()
+    assert crew._handles == [second]
+    assert said.getvalue() == "A worker cannot start (The worker died: no room) and is given up; 1 remain.\n"
+    for _ in range(cluster.STARTS):
+        crew._give_up()
+        crew._lose(second, "a traceback", "The worker died: no file")
+    with pytest.raises(Failure, match=r"No worker can start \(The worker died: no file\): try executor=inline"):
+        crew._give_up()
+
+
+def test_crew_takes_a_worker_that_was_out_of_reach_for_dead(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may have worked on without the driver's orders."""
+
+    def get(reference: str) -> str:
+        if reference == "a round":
+            raise ActorUnavailableError("The actor is temporarily unavailable.", None)
+        return reference
+
+    monkeypatch.setattr(cluster.ray, "get", get)
+    actor = SimpleNamespace(__ray_ready__=SimpleNamespace(remote=lambda: "an answer"))
+    handle = cluster.WorkerHandle("a", "a", actor=actor, answer="a round", up=True)
+    crew, _ = crew_of(monkeypatch, [handle])
+    assert crew._hear(handle) == []
+    assert (handle.answer, handle.up) == ("an answer", True)
+    (failed,) = crew._hear(handle)
+    assert failed.reason == "The worker was out of reach"
+    assert (handle.actor, handle.up, handle.out_of_reach) == (None, False, False)
+
+
+def test_crew_hands_on_the_units_of_a_lost_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    def get(_: str) -> None:
+        raise RayError("The node died.")
+
+    monkeypatch.setattr(cluster.ray, "get", get)
+    lost, other = (cluster.WorkerHandle(node, node, answer="a round", up=True) for node in "cb")
+    crew, said = crew_of(monkeypatch, [lost])
+    assert crew._hear(lost) == []
+    assert said.getvalue() == "c is lost; others take over level 0.\n"
+    assert crew._scheduler.waiting == 2
+    crew._scheduler.join(other, 0.0)
+    assert crew._scheduler.order(other, 0.0).units == [WorkUnit((0,))]
+
+
 def test_crew_starts_thousands_of_workers_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     """The crew polls for a signal to stop between parts, so it waits for no more than one."""
-    handles = [cluster.WorkerHandle("a", "a") for _ in range(3000)]
+    handles, now = [cluster.WorkerHandle("a", "a") for _ in range(3000)], [0.0]
 
     def start(handle: cluster.WorkerHandle, *_: Any) -> None:
-        time.sleep(0.01)  # as long as Ray takes
+        now[0] += cluster.STARTING / 64  # about as long as Ray takes
         handle.actor = "started"
 
     monkeypatch.setattr(cluster.WorkerHandle, "start", start)
-    monkeypatch.setattr(cluster, "STARTING", 0.1)
+    monkeypatch.setattr(cluster, "time", SimpleNamespace(monotonic=lambda: now[0]))
     monkeypatch.setattr(cluster.ray, "cluster_resources", dict)
     scheduler = Scheduler([WorkUnit(range(10_000))], 10_000)
     crew = cluster.Crew(made_job("data", "unit=1"), SPLIT, scheduler, Board(Tally(1, 0, 0), Console()))
     crew._handles = handles
     counts = [crew.start_workers() or sum(handle.starting for handle in handles) for _ in range(2)]
-    assert 0 < counts[0] < counts[1] < len(handles) / 10
+    assert counts == [65, 130], "it looks at the clock before it starts a worker"
 
 
 def test_worker_that_does_not_see_the_split_is_refused(
