@@ -1,11 +1,13 @@
 """Progress of a job: the counts, the estimates, and how they are shown."""
 
 import io
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
 from levelproof.experts.steps import EnvSteps
+from levelproof.pipeline.jobs import progress
 from levelproof.pipeline.jobs.progress import Board, Tally
 from levelproof.pipeline.jobs.schedule import Round, Summary, WorkUnit
 from levelproof.pipeline.words import duration, number
@@ -102,7 +104,8 @@ def test_board_takes_no_pace_from_two_moments() -> None:
     assert "· 5,000 env steps/s" in third
 
 
-def test_board_prints_few_lines_without_a_terminal() -> None:
+def test_board_prints_few_lines_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: 1000.0))
     text = io.StringIO()
     board = Board(tally(), Console(file=text))
     with board.shown():
@@ -119,7 +122,7 @@ def test_board_prints_few_lines_without_a_terminal() -> None:
 def test_board_prints_a_commit_once_the_last_line_is_old(monkeypatch: pytest.MonkeyPatch) -> None:
     text = io.StringIO()
     board = Board(tally(), Console(file=text))
-    monkeypatch.setattr("levelproof.pipeline.jobs.progress.LINE_AFTER", 0.0)
+    monkeypatch.setattr(progress, "LINE_AFTER", 0.0)
     board.refresh()
     board.ended(UNIT, Summary(16, 5, EnvSteps(trained=16_000)))
     assert "16/64 levels · 5 solved" in text.getvalue().splitlines()[1]
