@@ -10,11 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from levelproof.configs.compose import compose_job
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.labels import WITNESSED, Label, Source, Verdict
+from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy
+from levelproof.experts.networks.saved import Policy
 from levelproof.experts.pool.run import UnitResult
 from levelproof.experts.steps import EnvSteps
 from levelproof.experts.verdict.before import decide
@@ -27,6 +30,7 @@ from levelproof.physics.pairs import pairs_of
 from levelproof.physics.types import MAX_VERTICES, Size
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import commit
+from levelproof.pipeline.store.checksums import with_own
 from levelproof.pipeline.store.columns import OF_THE_RUN, stored_names
 from levelproof.pipeline.store.contents import highest
 from levelproof.pipeline.store.fields import arrays_of, same_bits, tree_of
@@ -34,6 +38,7 @@ from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.layout import split_path
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.shard import Shard
+from tests.quick import jit_once
 
 T = TypeVar("T")
 PLAYED = 64  # levels of `played_split`
@@ -226,6 +231,20 @@ def made_split(folder: Path, units: Sequence[Sequence[Label]], *words: str) -> P
         first += len(labels)
     note_job(path, job, ["levelproof", "generate"], [(0, first - 1)])
     return path
+
+
+def small_policy(size: Size | None = None, kind: PolicyKind = PolicyKind.INVARIANT) -> Policy:
+    """Return a policy with random weights, for levels of this size only or of any."""
+    network = NetworkConfig(kind, width=8, depth=1)
+    params = jit_once(initial_policy, static_argnums=(1, 2))(jax.random.key(0), network, size or SIZES["s"])
+    return Policy(network, params, size, {})
+
+
+def rewrite(path: Path, table: pa.Table, metadata: Mapping[Any, Any] | None = None, **how: Any) -> None:
+    """Write a table, with more metadata, as a fragment or a seed file with a valid digest; `how`: as in pyarrow."""
+    whole, about = pa.BufferOutputStream(), {**(table.schema.metadata or {}), **(metadata or {})}
+    pq.write_table(table.replace_schema_metadata(about), whole, **how)
+    path.write_bytes(with_own(whole.getvalue().to_pybytes()))
 
 
 def renamed_before(table: pa.Table) -> pa.Table:

@@ -22,7 +22,6 @@ from levelproof.pipeline.jobs.grow import grow
 from levelproof.pipeline.jobs.regenerate import kept_settings
 from levelproof.pipeline.look.diff import compare
 from levelproof.pipeline.store.checkpoints import require_same_experts
-from levelproof.pipeline.store.checksums import with_own
 from levelproof.pipeline.store.formats import CONFIG_KEY, HASH_KEY, VERSION_KEY
 from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
@@ -30,7 +29,7 @@ from levelproof.pipeline.store.seed.columns import SEED_KEY, WRITTEN
 from levelproof.pipeline.store.split import writing
 from levelproof.pipeline.verify.verify import examine
 from tests.pipeline.command import here
-from tests.pipeline.made import honest_split, made_job, made_split, renamed_before
+from tests.pipeline.made import honest_split, made_job, made_split, renamed_before, rewrite
 
 pytestmark = pytest.mark.slow
 
@@ -47,10 +46,8 @@ def aged(split: Path, version: int = 8) -> Path:
         about = _aged(table.schema.metadata) | {VERSION_KEY: str(version).encode()}
         at = table.schema.get_field_index("config_hash")
         hashes = pa.array([about[HASH_KEY].decode()] * table.num_rows)
-        table = renamed_before(table.set_column(at, table.schema.field(at), hashes)).replace_schema_metadata(about)
-        whole = pa.BufferOutputStream()
-        pq.write_table(table if version >= 8 else table.drop(["engine"]), whole)
-        path.write_bytes(with_own(whole.getvalue().to_pybytes()))
+        table = renamed_before(table.set_column(at, table.schema.field(at), hashes))
+        rewrite(path, table if version >= 8 else table.drop(["engine"]), about)
     job: Any = SimpleNamespace(results=decisive(made_job().results, EARLIER))
     job.hash = hash_of(job.results)
     note_job(split, job, ["levelproof", "generate"], [(0, UNIT * UNITS - 1)])

@@ -18,8 +18,8 @@ from rich.console import Console
 import levelproof
 from benchmarks.published import write as write_published
 from levelproof.experts.evaluation import do_nothing, play, play_most_probable, play_sampled
-from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy
-from levelproof.experts.networks.saved import Policy, save_policy
+from levelproof.experts.networks.over_levels import PolicyKind
+from levelproof.experts.networks.saved import save_policy
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.files.kinetix import state_to_kinetix
 from levelproof.levelgen.files.level_file import LevelFile, write_level_file
@@ -38,8 +38,7 @@ from levelproof.pipeline.read.agents import agent_in
 from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.command import ROOT, assert_refused, here, run
-from tests.pipeline.made import honest_split, made_job
-from tests.quick import jit_once
+from tests.pipeline.made import honest_split, made_job, small_policy
 
 ONCE = ("--attempts", "1")  # another number compiles other programs
 
@@ -51,9 +50,7 @@ def facts(folder: Path, *words: str) -> dict:
 
 
 def policy_in(folder: Path, kind: PolicyKind, size: str | None) -> Path:
-    config = NetworkConfig(kind=kind, width=16, depth=1)
-    params = jit_once(initial_policy, static_argnums=(1, 2))(jax.random.key(0), config, size_of(size or "5-1-1-1"))
-    save_policy(folder / "policy", Policy(config, params, size_of(size) if size else None, {}))
+    save_policy(folder / "policy", small_policy(size_of(size) if size else None, kind))
     return folder / "policy"
 
 

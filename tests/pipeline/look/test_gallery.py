@@ -12,22 +12,22 @@ import numpy as np
 import pytest
 
 from levelproof.experts.evaluation import play, play_sampled
-from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy
-from levelproof.experts.networks.saved import Policy, load_policy, save_policy
+from levelproof.experts.networks.over_levels import PolicyKind
+from levelproof.experts.networks.saved import load_policy, save_policy
 from levelproof.experts.witness.witness import steps_to_goal
 from levelproof.levelgen.level import SIZES
 from levelproof.pipeline.cli.gallery import MAX_LEVELS
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.look.entities import count_entities
 from levelproof.pipeline.look.gallery import gallery as module
-from levelproof.pipeline.look.gallery.gallery import BLOCK, gallery
+from levelproof.pipeline.look.gallery.gallery import gallery
 from levelproof.pipeline.look.gallery.pages import FLAGS, NOTHING, NUMBERS
 from levelproof.pipeline.look.gallery.worlds import ANGLE, LENGTH, angles
 from levelproof.pipeline.look.reasons import kind_of_reason
 from levelproof.pipeline.read.levels import levels_of, rules_of
 from levelproof.pipeline.read.rows import read_row
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
-from tests.pipeline.made import PLAYED
+from tests.pipeline.made import PLAYED, small_policy
 
 
 @pytest.fixture(scope="module")
@@ -139,9 +139,8 @@ def test_world_has_every_body_joint_and_thruster(site: Path, manifest: Manifest)
 
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder, network = tmp_path_factory.mktemp("policy"), NetworkConfig(PolicyKind.INVARIANT, width=8, depth=1)
-    params = jax.jit(initial_policy, static_argnums=(1, 2))(jax.random.key(0), network, SIZES["s"])
-    save_policy(folder, Policy(network, params, None, {}))
+    folder = tmp_path_factory.mktemp("policy")
+    save_policy(folder, small_policy())
     return folder
 
 
@@ -165,9 +164,7 @@ def test_policy_plays_every_level_as_evaluations_do(
 
 
 def test_policy_of_another_size_is_refused(split: Path, tmp_path: Path) -> None:
-    network = NetworkConfig(PolicyKind.FLAT, width=8, depth=1)
-    params = jax.jit(initial_policy, static_argnums=(1, 2))(jax.random.key(0), network, SIZES["m"])
-    save_policy(tmp_path, Policy(network, params, SIZES["m"], {}))
+    save_policy(tmp_path, small_policy(SIZES["m"], PolicyKind.FLAT))
     with pytest.raises(UserError, match="plays levels of size m only"):
         gallery(split, tmp_path / "site", None, 1, tmp_path)
     with pytest.raises(UserError, match="There is no policy in"):

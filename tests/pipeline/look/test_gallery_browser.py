@@ -6,15 +6,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 
 from benchmarks.browser import browser
-from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy
-from levelproof.experts.networks.saved import Policy, save_policy
+from levelproof.experts.networks.saved import save_policy
 from levelproof.experts.witness.witness import steps_to_goal
-from levelproof.levelgen.level import SIZES
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.look.gallery.gallery import gallery
 from levelproof.pipeline.look.gallery.worlds import ANGLE, LENGTH
@@ -22,7 +19,7 @@ from levelproof.pipeline.read.rows import read_row
 from levelproof.pipeline.store.manifest import require_manifest
 from tests.pace import patience
 from tests.pipeline.command import ROOT
-from tests.pipeline.made import PLAYED
+from tests.pipeline.made import PLAYED, small_policy
 
 DEMANDED = "LEVELPROOF_TEST_BROWSER"
 DESKTOP, PHONE = {"width": 1280, "height": 860}, {"width": 390, "height": 844}
@@ -232,9 +229,7 @@ def test_one_step_back_leaves_the_last_picture(page: Any, address: str, split: P
 
 
 def test_level_page_plays_a_policy_beside_the_witness(page: Any, split: Path, tmp_path: Path) -> None:
-    network = NetworkConfig(PolicyKind.INVARIANT, width=8, depth=1)
-    params = jax.jit(initial_policy, static_argnums=(1, 2))(jax.random.key(0), network, SIZES["s"])
-    save_policy(tmp_path / "policy", Policy(network, params, None, {}))
+    save_policy(tmp_path / "policy", small_policy())
     gallery(split, tmp_path / "site", None, PLAYED, tmp_path / "policy")
     page.goto((tmp_path / "site" / "index.html").as_uri())
     wait_until_drawn(page)

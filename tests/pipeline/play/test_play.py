@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 from websockets.exceptions import InvalidStatus
@@ -20,13 +19,10 @@ from websockets.typing import Origin
 
 import levelproof
 from levelproof.experts.config import RECORD_STEPS, StopConfig
-from levelproof.experts.networks.over_levels import NetworkConfig, PolicyKind, initial_policy
-from levelproof.experts.networks.saved import Policy
 from levelproof.experts.search.config import SearchConfig
 from levelproof.experts.witness.witness import replay, succeeds
 from levelproof.levelgen.files.level_file import from_document, to_document, write_level_file
 from levelproof.levelgen.level import SIZES
-from levelproof.physics.types import Size
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look.gallery.attempts import Contender
 from levelproof.pipeline.play import training
@@ -37,6 +33,7 @@ from levelproof.pipeline.store.manifest import require_manifest
 from tests.experts.small import untouched
 from tests.pace import patience
 from tests.pipeline.command import assert_refused, heed_ctrl_c, here, line_of, start
+from tests.pipeline.made import small_policy
 
 ANSWER_SECONDS = 120  # s; limit for an answer
 QUICK = replace(untouched(StopConfig()), search=SearchConfig(env_steps=65_536))
@@ -62,12 +59,6 @@ def connected(address: str, origin: str = "") -> ClientConnection:
     """Connect to the server at this address, from a page of `origin`, by default its own."""
     there, own = f"{address.replace('http', 'ws')}/socket", Origin(origin or address)
     return connect(there, origin=own, max_size=2**26, open_timeout=patience(10))
-
-
-def random_policy(size: Size | None) -> Policy:
-    network = NetworkConfig(PolicyKind.INVARIANT, width=8, depth=1)
-    params = jax.jit(initial_policy, static_argnums=(1, 2))(jax.random.key(0), network, SIZES["s"])
-    return Policy(network, params, size, {})
 
 
 def ask(page: ClientConnection, request: str, /, **fields: Any) -> dict[str, Any]:
@@ -169,7 +160,7 @@ def test_policy_attempts_are_played_from_the_start(split: Path) -> None:
     """Another attempt each time; a success is the level's witness, as if the user had played it."""
     row = next(row for row in require_manifest(split).table.to_pylist() if row["shard"])
     file, _ = level_to_play(split, row["level_id"], None)
-    session = Session(file, None, Contender(random_policy(None), 1))
+    session = Session(file, None, Contender(small_policy(), 1))
     assert session.level({})["policy"]
     films = [session.attempt({}) for _ in range(8)]
     assert len({json.dumps(film["actions"]) for film in films}) > 1
@@ -184,7 +175,7 @@ def test_policy_attempts_are_played_from_the_start(split: Path) -> None:
 
 @pytest.mark.parametrize("contender", [None, "of another size"])
 def test_page_without_a_policy_for_its_level_says_so(contender: str | None) -> None:
-    policy = Contender(random_policy(SIZES["s"]), 1) if contender else None
+    policy = Contender(small_policy(SIZES["s"]), 1) if contender else None
     session = Session(empty_file("m"), None, policy)
     assert not session.level({})["policy"]
     assert "--policy" in session.answer({"ask": "attempt"})["error"]

@@ -17,14 +17,13 @@ from levelproof.levelgen.files.level_file import read_level_file
 from levelproof.levelgen.identity.content import content_hashes
 from levelproof.pipeline.exchange.seed import export_seed
 from levelproof.pipeline.look import card as cards
-from levelproof.pipeline.store.checksums import with_own
 from levelproof.pipeline.store.manifest import read_manifest, write_index
 from levelproof.pipeline.store.seed.columns import CONTENT_KEY, SCHEMA, WRITTEN
 from levelproof.pipeline.store.seed.packed import ENTRIES
 from levelproof.pipeline.store.seed.rows import COSTS
 from levelproof.pipeline.verify.verify import examine
 from tests.pipeline.command import assert_refused, here, run
-from tests.pipeline.made import honest_split
+from tests.pipeline.made import honest_split, rewrite
 from tests.pipeline.servers import bucket_of, files_of, forget, hub_of, serving
 
 INLINE = "executor=inline"
@@ -61,9 +60,7 @@ def forged(seed: Path, path: Path, change: Callable[[Table, dict[bytes, Any]], A
     columns = pq.read_table(seed).to_pydict()
     about = {key: value for key, value in pq.read_metadata(seed).metadata.items() if not key.startswith(b"ARROW")}
     change(columns, about)
-    whole = pa.BufferOutputStream()
-    pq.write_table(pa.table(columns, schema=SCHEMA).replace_schema_metadata(about), whole, **WRITTEN)
-    path.write_bytes(with_own(whole.getvalue().to_pybytes()))
+    rewrite(path, pa.table(columns, schema=SCHEMA), about, **WRITTEN)
     return path
 
 

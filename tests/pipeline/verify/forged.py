@@ -9,11 +9,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from levelproof.experts.labels import Label
-from levelproof.pipeline.store.checksums import digests_of, with_own
+from levelproof.pipeline.store.checksums import digests_of
 from levelproof.pipeline.store.formats import DIGESTS_KEY
 from levelproof.pipeline.store.layout import DATA
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.verify.verify import examine
+from tests.pipeline.made import rewrite
 
 UNIT, UNITS = 8, 6  # of the split that is forged
 
@@ -31,10 +32,7 @@ def forge(split: Path, change: Callable[[Row], None] = lambda row: None, level_i
         named = {row["shard"] for row in rows if row["shard"] and DATA.fullmatch(row["shard"])}
         names = {name for name in named if (split / name).exists()}
         digests = {DIGESTS_KEY: json.dumps({name: digests_of(split / name) for name in names})}
-        whole = pa.BufferOutputStream()
-        forged = pa.Table.from_pylist(rows, schema=table.schema.with_metadata(table.schema.metadata | digests))
-        pq.write_table(forged, whole, write_page_checksum=True)
-        path.write_bytes(with_own(whole.getvalue().to_pybytes()))
+        rewrite(path, pa.Table.from_pylist(rows, schema=table.schema), digests, write_page_checksum=True)
 
 
 def rows_labelled(split: Path, *labels: Label) -> list[Row]:

@@ -5,7 +5,6 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -15,12 +14,12 @@ from levelproof.experts.labels import Label
 from levelproof.experts.witness.witness import Record, replay
 from levelproof.levelgen.level import ACTIONS, Level
 from levelproof.pipeline.errors import Failure
-from levelproof.pipeline.store.checksums import with_own
 from levelproof.pipeline.store.fields import arrays_of, tree_of
 from levelproof.pipeline.store.formats import CONFIG_KEY, HASH_KEY
 from levelproof.pipeline.store.manifest import fragment_paths
 from levelproof.pipeline.store.shard import Shard, write_shard
 from levelproof.pipeline.verify.verify import examine
+from tests.pipeline.made import rewrite
 from tests.pipeline.verify.forged import Row, assert_reported, forge, rows_labelled
 
 NOTHING = np.zeros((RECORD_STEPS, ACTIONS), np.int32)
@@ -65,12 +64,8 @@ def test_examine_is_refused_if_fragments_have_different_settings(split: Path) ->
     """Their levels are made or played differently, so no recipe fits all."""
     path = fragment_paths(split)[-1]
     table = pq.read_table(path)
-    metadata = table.schema.metadata or {}
-    config = json.loads(metadata[CONFIG_KEY])
+    config = json.loads((table.schema.metadata or {})[CONFIG_KEY])
     config["task"]["max_timesteps"] -= 1
-    other = {CONFIG_KEY: json.dumps(config), HASH_KEY: hash_of(config)}
-    whole = pa.BufferOutputStream()
-    pq.write_table(table.replace_schema_metadata(metadata | other), whole, write_page_checksum=True)
-    path.write_bytes(with_own(whole.getvalue().to_pybytes()))
+    rewrite(path, table, {CONFIG_KEY: json.dumps(config), HASH_KEY: hash_of(config)}, write_page_checksum=True)
     with pytest.raises(Failure, match=f"mixes two configurations, the one of {path.name} .*task.max_timesteps was"):
         examine(split)

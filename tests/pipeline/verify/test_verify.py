@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -23,7 +22,6 @@ from levelproof.pipeline.errors import Failure, StoreFailure
 from levelproof.pipeline.jobs import repair as repairing
 from levelproof.pipeline.store import fragment, remote
 from levelproof.pipeline.store import shard as shards
-from levelproof.pipeline.store.checksums import with_own
 from levelproof.pipeline.store.formats import VERSION_KEY
 from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.layout import JOB, MANIFEST, unit_name
@@ -35,7 +33,7 @@ from levelproof.pipeline.verify import verify as verifying
 from levelproof.pipeline.verify.findings import Findings
 from levelproof.pipeline.verify.verify import examine
 from tests.pipeline.command import assert_refused, here
-from tests.pipeline.made import honest_split, made_job
+from tests.pipeline.made import honest_split, made_job, rewrite
 from tests.pipeline.servers import files_of, serving
 from tests.pipeline.verify.forged import UNIT, UNITS, Row, assert_reported, forge, rows_labelled
 
@@ -281,11 +279,7 @@ def test_repair_removes_no_shard_of_another_version(split: Path, monkeypatch: py
 
 def test_repair_removes_no_fragment_of_another_version(split: Path) -> None:
     path = fragment_paths(split)[0]
-    table = pq.read_table(path)
-    whole = pa.BufferOutputStream()
-    other = table.replace_schema_metadata((table.schema.metadata or {}) | {VERSION_KEY: b"99"})
-    pq.write_table(other, whole, write_page_checksum=True)
-    path.write_bytes(with_own(whole.getvalue().to_pybytes()))
+    rewrite(path, pq.read_table(path), {VERSION_KEY: b"99"}, write_page_checksum=True)
     done = here(["verify", str(split), "--repair", "executor=inline"], split.parent)
     assert_refused(done, 1, str(path), "has manifest version 99", "use the levelproof that wrote it")
     assert path.exists()
