@@ -13,7 +13,8 @@ from levelproof.pipeline.play.server import HOST, serving
 from levelproof.pipeline.play.session import Session, empty_file
 from tests.pace import patience
 from tests.pipeline.look.test_gallery_browser import PRESSED, UNNAMED, chromium, patient
-from tests.pipeline.play.test_play import QUICK, driven_by_a_thruster, random_policy
+from tests.pipeline.made import small_policy
+from tests.pipeline.play.test_play import QUICK, driven_by_a_thruster
 
 __all__ = ["chromium"]  # a fixture
 pytestmark = pytest.mark.campaign
@@ -30,7 +31,7 @@ RECORDING = """() => {
 
 @pytest.fixture
 def page(chromium: Any) -> Iterator[Any]:
-    with serving(empty_file("m"), None, QUICK, 20_000, 0, Contender(random_policy(None), 1)) as server:
+    with serving(empty_file("m"), None, QUICK, 20_000, 0, Contender(small_policy(), 1)) as server:
         opened = patient(chromium.new_page(viewport={"width": 1280, "height": 900}, accept_downloads=True))
         opened.failures = []
         opened.on("pageerror", lambda error: opened.failures.append(str(error)))
