@@ -285,7 +285,7 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (0, 1, 4, "cpu", 1, 1),
         (3, 0, 4, "cpu", 4, 4),
         (3, 2, 4, "cpu", 2, 2),
-        (0, 4, 4, "gpu", 1, 4),
+        (0, 0, 4, "gpu", 1, 4),
     ],
 )
 def test_resumed_run_keeps_its_cores_and_a_new_one_takes_what_divides_its_lanes(
@@ -309,6 +309,10 @@ def test_cores_for_which_jax_has_too_few_devices_are_refused(monkeypatch: pytest
         with pytest.raises(
             levelproof.UserError, match=f"cores is {noted or asked}, .*for 1 in this process: set cores=1"
         ):
+            module.prepared_cores(TrainConfig(cores=asked), {"cores": noted})
+    monkeypatch.setattr(module.jax, "default_backend", lambda: "gpu")
+    for noted, asked, whose in ((0, 3, "The command asks for 3"), (2, 0, "The run so far used 2")):
+        with pytest.raises(levelproof.UserError, match=f"{whose} cores, but JAX uses a GPU here: set JAX_PLATFORMS"):
             module.prepared_cores(TrainConfig(cores=asked), {"cores": noted})
 
 
