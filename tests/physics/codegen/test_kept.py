@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -79,26 +80,25 @@ def test_cached_works_without_a_folder(folder: Path) -> None:
 
 
 @pytest.fixture
-def source(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Replace the kernels' sources by one file, written long before this process began."""
+def source(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Replace the kernels' sources by one file; this process begins an hour later."""
     path = tmp_path_factory.mktemp("sources") / "one.py"
     path.write_text("source")
-    os.utime(path, (0, 0))
+    monkeypatch.setattr(module, "BEGAN", time.time() + 3600)
     module._sources.cache_clear()
     yield path
     module._sources.cache_clear()
 
 
-def changed(source: Path, text: str, when: float) -> None:
+def changed(source: Path, text: str) -> None:
     source.write_text(text)
-    os.utime(source, (when, when))
     module._sources.cache_clear()
 
 
 def test_cached_notices_changed_sources(source: Path) -> None:
     make, calls = made(b"code")
     for text, so_far in (("source", 1), ("source", 1), ("other", 2), ("source", 2)):
-        changed(source, text, 0)
+        changed(source, text)
         assert cached_by_sources("one", make, [source.parent]) == b"code"
         assert len(calls) == so_far
     source.rename(source.with_name("two.py"))
@@ -108,10 +108,14 @@ def test_cached_notices_changed_sources(source: Path) -> None:
     assert len(calls) == 4
 
 
-def test_cached_stores_nothing_if_a_source_changed_since_the_start(source: Path, folder: Path) -> None:
-    """The process may still run the previous version."""
+def test_cached_stores_nothing_if_a_source_changed_since_the_start(
+    source: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The process may still run the previous version, also of a copy that keeps its original's time of change."""
     make, calls = made(b"code")
-    changed(source, "source", module.BEGAN + 1)
+    monkeypatch.setattr(module, "BEGAN", source.stat().st_ctime)
+    os.utime(source, (0, 0))
+    module._sources.cache_clear()
     assert [cached_by_sources("one", make, [source.parent]) for _ in range(2)] == [b"code"] * 2
     assert len(calls) == 2
     assert not list(folder.iterdir())
