@@ -38,11 +38,6 @@ class DistillConfig:
         require(self, ("states", "demonstrations"), 0)
         require(self, ("failed", "witnesses"), 0, 1)
         require(self, ("seed",), 0, 2**31 - 1)
-        if self.buffer < (most := (self.states + self.demonstrations) * self.path):
-            raise ValueError(
-                f"buffer is {self.buffer}: set it to at least (states + demonstrations) x path = {most}, or a round's "
-                "first labels are lost"
-            )
         if self.witnesses == 1:
             raise ValueError("witnesses is 1: set it below 1, or nothing is learned from teachers")
         if not (self.states or self.demonstrations):

@@ -34,8 +34,9 @@ def advantages(
 ) -> Float[Array, "time ..."]:
     """Estimate generalised advantages (Schulman et al. 2016, arXiv:1506.02438).
 
-    The value after an episode's end is 0, also at a time limit: a policy for all levels then learns nothing from the
-    last action, and the caller puts the value of the last state in place of its reward. Experts do not bootstrap there.
+    The value after an episode's end is 0, also at a time limit. There, a policy for all levels learns nothing from the
+    last action, and the caller puts the value of the last state in place of that action's reward. Experts do not
+    bootstrap.
     """
 
     def back(carry, now):

@@ -102,12 +102,12 @@ def on_device(levels: Level) -> Level:
     Raises:
         ValueError: there are no levels, or the level axis is missing or not the last one.
     """
-    count = len(levels) if np.ndim(levels.role) == 2 else 0
-    if count and not {x.shape[-1] for x in jax.tree.leaves(levels)} <= {1, count}:
-        count = 0
-    if not count:
+    lanes = sorted({count for x in jax.tree.leaves(levels) for count in x.shape[-1:]})
+    count = lanes[-1]
+    if np.ndim(levels.role) != 2 or 0 in lanes or not {*lanes} <= {1, count}:
         raise ValueError(
-            f"levels.role has shape {np.shape(levels.role)}, but must have (bodies, levels): give at least one level, "
+            f"levels.role has shape {np.shape(levels.role)}, which must be (bodies, levels), and last axes have "
+            f"lengths {', '.join(map(str, lanes))}, which must be the number of levels, or 1: give at least one level, "
             "level axis last, as sample_levels and Sampler.lanes do"
         )
     return jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x), (*x.shape[:-1], count)), levels)

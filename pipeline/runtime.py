@@ -127,8 +127,9 @@ def remove_damaged(folder: Path) -> None:
         new.touch()
         since = last.stat().st_mtime_ns if last.exists() else 0
         for path in folder.glob(".levelproof-*"):  # what `physics.codegen.kept` was writing in a killed process
-            if time.time() - path.stat().st_mtime > UNFINISHED:
-                path.unlink(missing_ok=True)
+            with suppress(FileNotFoundError):  # its writer has just finished it
+                if time.time() - path.stat().st_mtime > UNFINISHED:
+                    path.unlink()
         for path in folder.glob("*-cache"):
             try:
                 if path.stat().st_ctime_ns >= since:  # ns; ctime, because a copy may keep its original's mtime

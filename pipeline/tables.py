@@ -17,5 +17,5 @@ def console_for_tables() -> Console:
 def print_table(table: Table, console: Console) -> None:
     """Print a table; cells too long for a terminal continue on the next line."""
     for column in table.columns:
-        column.overflow = "fold"
+        column.overflow, column.no_wrap = "fold", False
     console.print(table)

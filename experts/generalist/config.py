@@ -39,8 +39,7 @@ class PPOConfig:
     kl_updates: int = 60  # updates after critic_updates over which kl_weight falls to 0
 
     def __post_init__(self) -> None:
-        require(self, ("env_steps", "environments", "epochs", "minibatches"), 1)
-        require(self, ("horizon",), 2)  # the last action of a rollout is not learned from
+        require(self, ("env_steps", "environments", "horizon", "epochs", "minibatches"), 1)
         require(self, ("repeat",), 1, MAX_REPEAT)
         require(self, ("learning_rate", "adam_epsilon", "max_gradient_norm"), 0, above=True)
         require(self, ("subsample",), 0, 1, above=True)
@@ -48,6 +47,10 @@ class PPOConfig:
         require(self, ("value_weight", "entropy_weight", "kl_weight"), 0)
         require(self, ("dense_reward_scale",), 0, MAX_REWARD_SCALE)
         require(self, ("critic_updates", "kl_updates"), 0)
+        if self.horizon == 1 and self.repeat < MAX_REPEAT:
+            raise ValueError(
+                "horizon is 1: set it to at least 2, because a rollout's last action counts only if it ends its episode"
+            )
 
     @property
     def steps_per_update(self) -> int:

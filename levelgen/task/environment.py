@@ -172,7 +172,6 @@ class Interface:
     action_type: ActionType
     observation_type: ObservationType
     rules: TaskParams
-    auto_reset: bool
     final_observation: bool
 
     @partial(jax.jit, static_argnums=0)
@@ -267,7 +266,7 @@ class Environment:
 
     @property
     def _interface(self) -> "Interface":
-        return Interface(self.action_type, self.observation_type, self.rules, self.auto_reset, self.final_observation)
+        return Interface(self.action_type, self.observation_type, self.rules, self.final_observation)
 
     @property
     def size(self) -> Size:

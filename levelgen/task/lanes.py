@@ -126,8 +126,13 @@ class Lanes:
                 Sampler, the level's id; ExtendedTable says what it is there.
 
         `info` has the entries of `Environment.step`, lanes last. No gradient flows through the world.
+
+        Raises:
+            ValueError: the action has another shape.
         """
         env, level = self.env, played.level
+        if action.shape[-1:] != state.level_index.shape:
+            raise ValueError(f"actions have shape {action.shape}, but there are {len(state.level_index)} lanes")
         state, action = jax.lax.stop_gradient((state, action))
         driven = CONTROLS[env.action_type](level, action)
         now, result, closing, _ = task.advance_driven(level, state.now, driven, env.rules)

@@ -15,7 +15,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_split(parser)
     add_json(parser)
     parser.add_argument(
-        "--watch", action="store_true", help="refresh until no run is active; with --json, one line per refresh"
+        "--watch",
+        action="store_true",
+        help="refresh until no run is active, every 2 s (tables in a file or pipe: 30 s); with --json, one line each",
     )
 
 

@@ -177,7 +177,7 @@ def _stored(job: JobConfig, split: Path, table: pa.Table, folder: Path) -> dict[
 def _announced(console: Console, seconds: float) -> Iterator[None]:
     """Tell the user that the `with` block takes a while."""
     text = f"making some of the levels here: about {duration(seconds)}, plus compiling ..."
-    if not console.is_terminal:
+    if not console.is_interactive:
         say(console, text.capitalize())
         yield
         return

@@ -154,6 +154,12 @@ def levels_for(split: Path, config: DistillConfig, tell: Callable[[str], None]) 
             f"{split} has no kept experts of these levels, and {only}: set {remedy}, or make a split on this "
             "machine with keep_experts=true."
         )
+    shown = min(config.demonstrations, int((experts.expert >= 0).sum()))
+    if config.buffer < (most := (config.states + shown) * config.path):
+        raise UserError(
+            f"buffer is {config.buffer:,}, but a round has up to {most:,} transitions, {config.path} of each of "
+            f"{config.states + shown:,} labels: raise buffer to that, or the round's first labels are lost."
+        )
     return ChosenLevels(data, chosen, facts, experts)
 
 

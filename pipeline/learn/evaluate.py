@@ -284,7 +284,7 @@ def _print(facts: dict[str, Any], attempts: int, console: Console) -> None:
         console.print(f"{facts['levels']}: {many(count, 'level')} ({title})", soft_wrap=True)
         table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))  # fits 80 columns
         for column in ("", "one attempt", f"best of {attempts}", "worst tenth", "steps"):
-            table.add_column(column, justify="right" if table.columns else "left", no_wrap=True)
+            table.add_column(column, justify="right" if table.columns else "left")
         for name, rates in players.items():
             steps = "-" if rates["steps"] is None else f"{rates['steps']:.0f}"
             table.add_row(name, *(_shown_rate(rates[key]) for key in ("once", "best", "worst")), steps)

@@ -108,8 +108,8 @@ def prepared_cores(config: TrainConfig, note: dict[str, Any] | None) -> int:
     prepare_jax(devices=wanted or even)
     if jax.default_backend() != "cpu":
         if wanted > 1:
-            whose = "the run so far used" if noted else "the command asks for"
-            raise UserError(f"{whose.capitalize()} {wanted} cores, but JAX uses a GPU here: set JAX_PLATFORMS=cpu.")
+            whose = "The run so far used" if wanted == noted else "The command asks for"
+            raise UserError(f"{whose} {wanted} cores, but JAX uses a GPU here: set JAX_PLATFORMS=cpu.")
         return 1
     there = len(jax.devices())
     if wanted > there:

@@ -111,9 +111,12 @@ def _require_ours(out: Path) -> None:
 
 def _require_own_names(facts: Sequence[SplitFacts]) -> None:
     """Refuse splits whose subsets on the hub, and previews, would have the same name."""
-    paths = {PREVIEW: "the pictured sample"}
-    previews: dict[str, str] = {}
+    paths, previews = dict[str, str](), dict[str, str]()
     for split in facts:
+        if split.subset == PREVIEW:
+            raise UserError(
+                f"The subset of {split.path} would be named {PREVIEW}, as that of the pictures is: rename it."
+            )
         for names, name, kind in ((paths, split.subset, "subset"), (previews, split.preview, "preview")):
             if (other := names.setdefault(name, split.path)) != split.path:
                 raise UserError(f"Both {other} and {split.path} would be the {kind} {name}: rename one of them.")

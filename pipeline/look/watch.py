@@ -1,6 +1,7 @@
 """Live view of a job, from the events that its latest run writes to the split; needs no contact with workers."""
 
 import json
+import math
 import sys
 import time
 from collections.abc import Callable, Collection
@@ -45,14 +46,18 @@ def watch(split: Path, as_json: bool, console: Console, interval: float = INTERV
         with Live(console=console, auto_refresh=False) as live:
             _follow(split, interval, lambda facts: live.update(progress_table(facts), refresh=True))
     else:  # a live view would appear only when it ends
-        _follow(split, max(interval, LINE_EVERY), lambda facts: console.print(progress_table(facts)))
+        _follow(split, interval, lambda facts: console.print(progress_table(facts)), LINE_EVERY)
 
 
-def _follow(split: Path, interval: float, show: Callable[[dict[str, Any]], None]) -> None:
+def _follow(split: Path, interval: float, show: Callable[[dict[str, Any]], None], shown_every: float = 0.0) -> None:
+    """Read a job's progress every `interval` s, and show it every `shown_every` s and when the run has ended."""
+    shown_at = -math.inf
     before = [path for path in runs_in(split) if any(event["event"] == "ended" for event in events_of(path))]
     while True:
         facts = read_progress(split, before)
-        show(facts)
+        if not facts["running"] or time.monotonic() - shown_at >= shown_every:
+            shown_at = time.monotonic()
+            show(facts)
         if not facts["running"] or not has_reader():
             return
         time.sleep(interval)
@@ -106,4 +111,6 @@ def progress_table(facts: dict[str, Any]) -> Table:
     }
     for name, text in lines.items():
         table.add_row(readable(name), readable(text))
+    for column in table.columns:
+        column.overflow = "fold"
     return table

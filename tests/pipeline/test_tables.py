@@ -12,7 +12,8 @@ PATH = "/data/experiments/" + "x" * 150 + "/128k/s"
 
 
 def table() -> Table:
-    table = Table("level_id", "file", box=None)
+    table = Table("level_id", box=None)
+    table.add_column("file", no_wrap=True)
     table.add_row("7", PATH)
     return table
 

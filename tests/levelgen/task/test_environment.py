@@ -319,9 +319,12 @@ def test_equal_settings_share_programs_which_keep_no_levels(levels: Level) -> No
 
 def test_levels_of_other_axes_and_types_are_refused(levels: Level) -> None:
     one, first = jax.tree.map(lambda x: x[..., 0], levels), jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), levels)
-    for wrong in one, first:
+    uneven = replace(levels, density=levels.density[:, :3])
+    for wrong in one, first, uneven:
         for takes in make, starts:
-            with pytest.raises(ValueError, match=r"levels.role has shape .*, but must have \(bodies, levels\)"):
+            with pytest.raises(
+                ValueError, match=r"levels.role has shape .* last axes have lengths [\d, ]+, which must"
+            ):
                 takes(wrong)
     with pytest.raises(ValueError, match=r"of a level file, give file\.level, and rules=file\.rules"):
         make(LevelFile(levels, task.DEFAULT_RULES))  # pyright: ignore[reportArgumentType]

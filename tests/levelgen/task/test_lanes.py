@@ -61,9 +61,13 @@ def test_lanes_take_numpy_levels_and_refuse_actions_of_another_type(levels: Leve
     _, state, played = jax.eval_shape(lanes.reset, table, jnp.arange(3))
     step = lambda action: jax.eval_shape(lanes.step, table, played, state, action, jnp.arange(3))
     assert step(jnp.zeros((6, 3), int))[3].shape == (3,)
-    for wrong in jnp.zeros(3, int), jnp.zeros((3, 6), int):
-        with pytest.raises(ValueError, match=r"actions have shape .*, but must have \(6, lanes\)"):
-            step(wrong)
+    for shape, words in (
+        ((3,), r"\(3,\), but must have \(6, lanes\)"),
+        ((3, 6), r"\(3, 6\), but there are 3"),
+        ((6, 1), r"\(6, 1\), but there are 3"),
+    ):
+        with pytest.raises(ValueError, match=f"actions have shape {words}"):
+            step(jnp.zeros(shape, int))
     discrete = Lanes(make(levels, "discrete")[0])
     with pytest.raises(ValueError, match=r"but must have \(lanes\)"):
         jax.eval_shape(discrete.step, table, played, state, jnp.zeros((6, 3), int), jnp.arange(3))

@@ -288,7 +288,7 @@ def test_trivial_levels_are_left_out(tmp_path: Path) -> None:
             "network.width cannot change the network",
         ),
         (["SPLIT", "witnesses=1"], "witnesses is 1"),
-        (["SPLIT", "buffer=4095"], "at least (states + demonstrations) x path = 4096"),
+        (["SPLIT", "buffer=4095"], "up to 4,096 transitions, 16 of each of 256 labels"),
         (["SPLIT", "states=0"], "states and demonstrations are both 0"),
         (["SPLIT", "demonstrations=4"], "no kept experts of these levels, and demonstrations need them"),
         (["SPLIT", "teachers.perturbed=1"], "teachers.perturbed has no effect without demonstrations"),

@@ -17,11 +17,11 @@
     return element;
   }
 
-  // What a key means on any keyboard: its letter in lower case; if it has none, as on Russian keyboards and for digits on
-  // French ones, what an American keyboard has in its place.
+  // What a key means on any keyboard: its letter in lower case. If it has none, what an American keyboard has in its
+  // place: a letter if the keyboard has others, as Russian ones do, or a digit, which on French ones needs Shift.
   function keyOf({ key = "", code = "" }) {
     if (key.length > 1) return key;
-    const place = /[a-z0-9 ]/i.test(key) ? null : code.match(/^(?:Key|Digit)(.)$/);
+    const place = /[a-z0-9 ]/i.test(key) ? null : code.match(/^[\x20-\x7e]/.test(key) ? /^Digit(.)$/ : /^(?:Key|Digit)(.)$/);
     return (place ? place[1] : key).toLowerCase();
   }
 

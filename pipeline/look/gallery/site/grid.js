@@ -200,7 +200,9 @@
       const block = (index) => Math.floor(index / this.columns.about.block);
       this.worlds.get(row).catch((error) => {
         levelproof.report(error.message);
-        this.queue = this.queue.filter((wanted) => block(wanted.row) !== block(row));
+        const failed = (wanted) => block(wanted.row) === block(row);
+        for (const { cell } of this.queue.filter(failed)) cell.row = undefined; // to be drawn when it is next filled
+        this.queue = this.queue.filter((wanted) => !failed(wanted));
       }).finally(() => {
         this.loading--;
         this.later();
