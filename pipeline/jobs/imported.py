@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
-from rich.progress import track
 
 from levelproof.configs.compose import compose_job
 from levelproof.configs.schema import ImportConfig
@@ -36,6 +35,7 @@ from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.layout import ids_of, split_path
 from levelproof.pipeline.store.manifest import Manifest, any_within, read_manifest
 from levelproof.pipeline.store.origins import Origin, RecordPlace, can_be_noted
+from levelproof.pipeline.store.progress_bar import ProgressBar
 from levelproof.pipeline.store.remote import require_folder
 from levelproof.pipeline.store.runs import runs
 from levelproof.pipeline.store.seed.file import is_seed
@@ -88,16 +88,19 @@ def import_folder(folder: Path, out: Path, console: Console) -> Exit:
         already = f", {done} of {len(parts)} units are already there" if done else ""
         say(console, f"{many(source.rows, 'trajectory')} of size {job.size} into {split}{already}")
         skipped: Counter[str] = Counter()  # number of records by reason
-        shown = track(left, "units of trajectories", console=console, transient=True, disable=not console.is_terminal)
         firsts = [*(part.unit.level_ids[0] for part in left[1:]), None]  # first level id after each unit
         try:
-            with sealing(split, manifest.counting, partial(say, console)) as sealer:
-                for part, first in zip(shown, firsts, strict=False):
+            with (
+                sealing(split, manifest.counting, partial(say, console)) as sealer,
+                ProgressBar("units of trajectories", len(left), console) as bar,
+            ):
+                for part, first in zip(left, firsts, strict=False):
                     reported = sum(skipped.values())
                     wrong = _import(job, split, source, part, shlex.join(command), console, reported)
                     skipped.update(wrong)
                     sealer.committed(part.unit.name, len(part.unit.level_ids) - len(wrong))
                     sealer.advance(first)
+                    bar.advance(1)
         except KeyboardInterrupt:
             say(console, "Stopped: committed units stay; run the same command to continue.")
             raise

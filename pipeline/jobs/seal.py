@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from levelproof.configs.schema import KEY_EVERY, KEYS_EVERY, Density, stored_as
 from levelproof.pipeline.errors import LevelproofError, UserError
@@ -22,6 +21,7 @@ from levelproof.pipeline.store.disk import explaining_writes
 from levelproof.pipeline.store.job_note import note_density
 from levelproof.pipeline.store.layout import fragment_path, unit_name
 from levelproof.pipeline.store.manifest import Fragment, require_manifest, write_index
+from levelproof.pipeline.store.progress_bar import ProgressBar
 from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.scratch import written_disk
 from levelproof.pipeline.store.seal import Piece, seal
@@ -62,14 +62,12 @@ def seal_split(
             others = {fragment.path for fragment in manifest.counting if fragment.densities != {stored_as(*wanted)}}
             planned = {piece for group in groups for piece in group}
             groups += [[piece] for piece in pieces if piece.path in others and piece not in planned]
-        columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
-        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-            task = bar.add_task("levels sealed", total=sum(piece.rows for group in groups for piece in group))
-            done = 0
+        total, end = sum(piece.rows for group in groups for piece in group), 0
+        with ProgressBar("levels sealed", total, console) as bar:
             for group in groups:
-                done += sum(piece.rows for piece in group)
-                seal(split, group, density=wanted, converted=partial(bar.advance, task))
-                bar.update(task, completed=done)
+                end += sum(piece.rows for piece in group)
+                seal(split, group, density=wanted, converted=bar.advance)
+                bar.advance(end - bar.completed)  # those that had nothing to convert
             write_index(split)
             if density:
                 note_density(split, density, key_every)

@@ -34,6 +34,11 @@ class ProgressBar:
             self._bar.stop()
             ON_TERMINAL.release()
 
+    @property
+    def completed(self) -> int:
+        """Number of finished items."""
+        return int(self._bar.tasks[0].completed)
+
     def advance(self, count: int) -> None:
         """Add `count` finished items."""
         if self._console is None:
