@@ -10,7 +10,7 @@ from http.client import HTTPException
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.error import HTTPError
-from urllib.parse import quote
+from urllib.parse import quote, unquote
 from urllib.request import Request, urlopen
 
 from levelproof.pipeline.errors import StoreFailure, UserError
@@ -23,7 +23,7 @@ NEXT = re.compile(r'<([^<>]+)>; *rel="next"')  # in the header Link: the next pa
 
 
 class Repository(NamedTuple):
-    """A dataset at a revision: a branch, a tag or a commit."""
+    """A dataset at a revision: a branch, a tag, a commit, or a ref such as refs/pr/1."""
 
     name: str
     revision: str
@@ -40,7 +40,8 @@ def split_url(parts: Sequence[str]) -> tuple[Repository, str]:
             f"hf://{'/'.join(parts)} is not the URL of a dataset: give one such as hf://datasets/USER/NAME/1M/s."
         )
     name, _, revision = parts[2].partition("@")
-    return Repository(f"{parts[1]}/{name}", revision or "main"), "/".join(parts[3:])
+    revision = unquote(revision) or "main"  # a / in it, as in refs/pr/1, is typed %2F
+    return Repository(f"{parts[1]}/{name}", revision), "/".join(parts[3:])
 
 
 def resolve_url(repository: Repository) -> str:

@@ -15,6 +15,7 @@ from hashlib import sha256
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from urllib.parse import unquote
 
 from levelproof.pipeline.errors import LevelproofError, StoreFailure, UserError
 from levelproof.pipeline.runtime import cache_folder
@@ -288,7 +289,8 @@ def place(path: Path) -> tuple["ObjectStore", str]:
         return _store("hf:", repository), key
     if len(path.parts) < 2:
         raise UserError(f"The URL {as_typed(path)} names no split: give one such as s3://bucket/data/128k/s.")
-    return _store(path.parts[0], path.parts[1]), "/".join(path.parts[2:])
+    key = "/".join(path.parts[2:])  # obstore quotes it in requests, and would quote a URL's %20 twice
+    return _store(path.parts[0], path.parts[1]), unquote(key) if path.parts[0] in WEB else key
 
 
 @lru_cache(maxsize=64)

@@ -257,9 +257,12 @@ def tag_of(file: Path) -> str:
     return hashlib.md5(file.read_bytes()).hexdigest()
 
 
-def hub_of(folder: Path, dataset: str, token: str, page: int) -> Answers:
-    """Serve the hub's two endpoints for a dataset's files: lists in pages, and redirects to the files."""
-    resolved, listed = f"/datasets/{dataset}/resolve/main/", f"/api/datasets/{dataset}/tree/main"
+def hub_of(folder: Path, dataset: str, token: str, page: int, revision: str = "main") -> Answers:
+    """Serve the hub's two endpoints for a dataset's files: lists in pages, and redirects to the files.
+
+    `revision` is what requests have in their URLs, so that a / in it is %2F.
+    """
+    resolved, listed = f"/datasets/{dataset}/resolve/{revision}/", f"/api/datasets/{dataset}/tree/{revision}"
     files = files_of(folder)
 
     def answers(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:

@@ -33,7 +33,7 @@ from levelproof.pipeline.store.fragment import read_fragment
 from levelproof.pipeline.store.job_note import NoteError, note_job, read_note
 from levelproof.pipeline.store.layout import FRAGMENT, MANIFEST, WRITER_LOCK, entries
 from levelproof.pipeline.store.leases import is_leased
-from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, require_manifest
+from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, require_manifest, write_index
 from tests.pace import patience
 from tests.pipeline.command import ROOT, assert_refused, line_of
 from tests.pipeline.command import here as command
@@ -404,6 +404,24 @@ def test_split_on_a_web_server_reads_as_its_folder(split: Path, tmp_path: Path) 
         forget()
         shutil.rmtree(os.environ["LEVELPROOF_CACHE_DIR"])
         require_same(there, folder)
+
+
+def test_quoted_url_of_a_web_server_is_quoted_once(split: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(split, tmp_path / "www/my data/100%/s"))
+    write_index(folder)
+    with serving(files_of(tmp_path / "www")) as server:
+        require_same(Path(f"{server.url}/my%20data/100%25/s"), folder)
+        assert {line.split()[1].partition("/s/")[0] for line in server.log} == {"/my%20data/100%25"}
+
+
+def test_revision_of_the_hub_with_a_slash_is_quoted_once(
+    split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(split, tmp_path / "repository/1M/s")
+    monkeypatch.setenv("HF_TOKEN", "secret")
+    with serving(hub_of(tmp_path / "repository", "user/name", "secret", 2, "refs%2Fpr%2F1")) as server:
+        monkeypatch.setenv("HF_ENDPOINT", server.url)
+        require_same(Path("hf://datasets/user/name@refs%2Fpr%2F1/1M/s"), split)
 
 
 def test_split_on_the_hub_reads_as_its_folder(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
