@@ -20,6 +20,7 @@ from levelproof.pipeline.store.layout import COMMIT_LOCK, WRITER_LOCK
 from levelproof.pipeline.store.leases import is_leased, leased, named, require_served
 from levelproof.pipeline.store.publish import publishing
 from levelproof.pipeline.store.remote import is_remote
+from levelproof.pipeline.urls import BUCKETS
 
 PATIENCE = 1.0  # s to wait for the writer's lock, because `is_written` holds it for a moment
 NOTICE = 2.0  # s of waiting before the user is told the reason
@@ -124,10 +125,11 @@ def without_commits(split: Path, say: Callable[[str], None]) -> Iterator[None]:
 def is_written(split: Path, say: Callable[[str], None] = lambda _: None) -> bool:
     """Whether a levelproof command is writing to this split now; needs read access only.
 
+    Nothing writes to web servers and the hub. They are not even asked: many deny files whose names begin with a dot.
     Passes `say` the reason for a long wait, which happens only in a store.
     """
     if is_remote(split):
-        return is_leased(split, say)
+        return split.parts[0] in BUCKETS and is_leased(split, say)
     try:
         with open(split / WRITER_LOCK, opener=regular) as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -406,6 +406,16 @@ def test_split_on_a_web_server_reads_as_its_folder(split: Path, tmp_path: Path) 
         require_same(there, folder)
 
 
+def test_status_on_a_web_server_that_denies_dotfiles_is_that_of_the_folder(split: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(split, tmp_path / "s"))
+    write_index(folder)
+    files = files_of(tmp_path)
+    with serving(lambda *request: Answer(403, {}, b"") if "/." in request[1] else files(*request)) as server:
+        there, here = (command(["status", str(path)], tmp_path) for path in (Path(f"{server.url}/s"), folder))
+        assert there.returncode == 0, there.stderr
+        assert there.stdout == here.stdout.replace(str(folder), f"{server.url}/s")
+
+
 def test_quoted_url_of_a_web_server_is_quoted_once(split: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(split, tmp_path / "www/my data/100%/s"))
     write_index(folder)
