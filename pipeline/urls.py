@@ -10,6 +10,15 @@ BUILTIN = "builtin:"  # as in experts.networks.saved, which this file must not i
 SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
 
 
+def is_remote(path: Path) -> bool:
+    return bool(path.parts) and path.parts[0] in (*BUCKETS, *WEB, *HUB)
+
+
+def as_typed(path: Path) -> str:
+    """Return a path or URL as the user typed it."""
+    return "//".join([path.parts[0], "/".join(path.parts[1:])]) if is_remote(path) else str(path)
+
+
 def require_known(path: Path) -> None:
     """Raise UserError for a URL of an unsupported scheme, which would otherwise be taken for a folder."""
     first = path.parts[0] if path.parts else ""
@@ -24,11 +33,8 @@ def require_known(path: Path) -> None:
 def require_here(path: Path) -> None:
     """Raise UserError for a URL, because the caller writes to this machine only."""
     require_known(path)
-    if path.parts and path.parts[0] in (*BUCKETS, *WEB, *HUB):
-        raise UserError(
-            f"This command cannot write to {path.parts[0]}//{'/'.join(path.parts[1:])}: "
-            "give a file or folder on this machine."
-        )
+    if is_remote(path):
+        raise UserError(f"This command cannot write to {as_typed(path)}: give a file or folder on this machine.")
 
 
 def require_policy(path: Path) -> None:

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from levelproof.pipeline.errors import StoreFailure, UserError
-from levelproof.pipeline.store.remote import as_typed, ask, data_of, obstore_module, place
-from levelproof.pipeline.urls import BUCKETS
+from levelproof.pipeline.store.remote import place
+from levelproof.pipeline.store.requests import ask, data_of, obstore_module
+from levelproof.pipeline.urls import BUCKETS, as_typed
 
 PART = 2**25  # bytes; larger files are sent in parts
 

@@ -4,24 +4,21 @@ A split's Path may stand for a URL: `is_remote` says whether it does, and `place
 """
 
 import os
-import random
 import re
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from datetime import timedelta
 from functools import lru_cache
 from hashlib import sha256
-from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from urllib.parse import unquote
 
-from levelproof.pipeline.errors import LevelproofError, StoreFailure, UserError
+from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.runtime import cache_folder
 from levelproof.pipeline.store import hub
 from levelproof.pipeline.store.pieces import PieceCache
-from levelproof.pipeline.urls import BUCKETS, HUB, WEB
+from levelproof.pipeline.store.requests import PATIENCE, REQUESTS, RETRIES, ask, data_of, obstore_module
+from levelproof.pipeline.urls import BUCKETS, HUB, WEB, as_typed, is_remote
 
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
@@ -30,27 +27,8 @@ INDEX = "index.txt"  # in the manifest's folder: names of the fragments, for ser
 MAX_INDEX = 2**25  # bytes of it; a name takes 34
 PIECE = 2**20  # bytes; with 4 MB, random reads of 10 kB trajectories would fetch four times as much
 MAX_PIECES = 8  # adjacent pieces that one request fetches
-REQUESTS = 16  # concurrent
 MAX_WHOLE = 2**29  # bytes of a file that is read as a whole, such as a fragment
 CACHE_GB = "LEVELPROOF_CACHE_GB"
-RETRIES: dict[str, Any] = {
-    "max_retries": 8,  # of a request that is throttled, refused, cut off or not answered; with jitter
-    "retry_timeout": timedelta(seconds=60),
-    "backoff": {"init_backoff": timedelta(seconds=0.1), "max_backoff": timedelta(seconds=8), "base": 2},
-}
-PATIENCE = {"connect_timeout": timedelta(seconds=5), "timeout": timedelta(seconds=60), "allow_http": True}
-SIGN_IN = {
-    "s3:": "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for a public bucket",
-    "gs:": "set GOOGLE_APPLICATION_CREDENTIALS, or GOOGLE_SKIP_SIGNATURE=true for a public bucket",
-    "az:": "set AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY",
-    "hf:": "set HF_TOKEN, or run `hf auth login`",
-}
-# Patterns in obstore's messages about failed requests:
-STATUS = re.compile(r"status code: (\d{3}[A-Za-z ]*)")
-PASSING = re.compile(r"status code: (408|409|429|50[02-4])")
-NO_BUCKET = "NoSuchBucket"
-CUT_OFF, SILENT = "response body error", "HTTP error"  # a response ends early; no response arrives
-CLOUD = re.compile(r"latest/api/token|computeMetadata")  # endpoints where a cloud's machines get credentials
 COPY = {"s3:": "aws s3 sync", "gs:": "gcloud storage rsync -r", "az:": "azcopy sync", "hf:": "hf download"}
 
 T = TypeVar("T")
@@ -67,18 +45,9 @@ class FileChanged(OSError):
     """A file differs from the version that was listed."""
 
 
-def is_remote(path: Path) -> bool:
-    return bool(path.parts) and path.parts[0] in (*BUCKETS, *WEB, *HUB)
-
-
 def is_listed(split: Path) -> bool:
     """Whether all files of a split can be listed."""
     return not (split.parts and split.parts[0] in WEB)
-
-
-def as_typed(path: Path) -> str:
-    """Return a path or URL as the user typed it."""
-    return "//".join([path.parts[0], "/".join(path.parts[1:])]) if is_remote(path) else str(path)
 
 
 def absolute(path: Path) -> Path:
@@ -302,17 +271,6 @@ def _store(scheme: str, root: Any) -> "ObjectStore":
     return make(url, client_options=options, retry_config=RETRIES)
 
 
-def obstore_module() -> Any:
-    try:
-        import obstore.exceptions
-        import obstore.store
-    except ImportError:
-        raise UserError(
-            'Reading splits that are not on this machine needs obstore: run `pip install -e ".[remote]"` in the clone.'
-        ) from None
-    return obstore
-
-
 @lru_cache(maxsize=1)
 def _first_process() -> int:
     """Return the PID of the first process to use stores; forked processes lack its threads."""
@@ -337,57 +295,3 @@ def _cache() -> PieceCache:
 @lru_cache(maxsize=8)
 def _cache_in(folder: Path, most: int) -> PieceCache:
     return PieceCache(folder, most)
-
-
-def data_of(answer: Any, most: float) -> bytes:
-    """Read the bytes of a response; stop soon after `most`, so that the caller sees that it is too long."""
-    data = bytearray()
-    for part in answer.stream(min_chunk_size=PIECE):
-        data += part
-        if len(data) > most:
-            break
-    return bytes(data)
-
-
-def ask(path: Path, request: Callable[[], T], what: str = "read") -> T:
-    """Make a request, and retry it if the response is cut off or missing, in cases that obstore does not retry.
-
-    obstore seldom retries cut-off responses, and never requests that it does not know to be idempotent.
-
-    Raises:
-        FileNotFoundError: the store has no such file.
-        UserError: it has no such bucket, or does not allow us to `what`.
-        StoreFailure: it does not answer.
-    """
-    exceptions, end = obstore_module().exceptions, time.monotonic() + RETRIES["retry_timeout"].total_seconds()
-    for attempt in count():
-        try:
-            return request()
-        except FileNotFoundError as error:
-            if NO_BUCKET in str(error):
-                raise _explained(path, str(error), what) from None
-            raise FileNotFoundError(as_typed(path)) from None
-        except exceptions.BaseError as error:
-            text = str(error)
-            passing = CUT_OFF in text or SILENT in text or PASSING.search(text)
-            if not passing or CLOUD.search(text) or time.monotonic() > end:
-                raise _explained(path, text, what) from None
-            time.sleep(random.uniform(0, min(0.1 * 2**attempt, 5)))
-    raise AssertionError("unreachable")
-
-
-def _explained(path: Path, text: str, what: str) -> LevelproofError:
-    """Turn obstore's message about a failed request into a sentence."""
-    url, how = as_typed(path), SIGN_IN.get(path.parts[0], "copy the split to a folder first")
-    if NO_BUCKET in text:
-        return UserError(f"There is no bucket {path.parts[1]!r}: check {url}.")
-    if CLOUD.search(text):
-        return UserError(f"There are no credentials to {what} {url}: {how}.")
-    if "Range request not supported" in text:
-        return StoreFailure(f"The server of {url} does not support range requests: copy the split to a folder first.")
-    status = STATUS.search(text)
-    reason = status[1].strip() if status else "it does not answer" if SILENT in text else text.splitlines()[0]
-    if reason.startswith(("401", "403")):
-        return UserError(f"The store does not let you {what} {url} ({reason}): {how}.")
-    then = "run the same command again; what is committed stays" if what == "write" else "try again"
-    return StoreFailure(f"Cannot {what} {url} ({reason}): check the network and the URL, and {then}.")

@@ -23,7 +23,7 @@ from urllib.parse import parse_qs, unquote, urlsplit
 
 import pytest
 
-from levelproof.pipeline.store import leases, remote
+from levelproof.pipeline.store import leases, remote, requests
 from tests.pace import patience, wait_until
 
 HOST = "127.0.0.1"
@@ -142,8 +142,8 @@ def serving_bucket(
         answers: function that answers requests (default: that of `bucket_of`).
     """
     patch.setenv("LEVELPROOF_CACHE_DIR", str(folder / "cache"))
-    patch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=seconds))
-    patch.setitem(remote.RETRIES, "backoff", {"init_backoff": timedelta(milliseconds=5)})
+    patch.setitem(requests.RETRIES, "retry_timeout", timedelta(seconds=seconds))
+    patch.setitem(requests.RETRIES, "backoff", {"init_backoff": timedelta(milliseconds=5)})
     (folder / "s3/bucket").mkdir(parents=True)
     with serving(answers or bucket_of(folder / "s3")) as server:
         for name in [name for name in os.environ if name.startswith("AWS_")]:

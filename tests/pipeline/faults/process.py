@@ -27,7 +27,7 @@ import numpy as np
 from levelproof.configs import compose
 from levelproof.pipeline.cli.main import main
 from levelproof.pipeline.jobs import inline, unit
-from levelproof.pipeline.store import density, event_files, leases, remote, seal, shard
+from levelproof.pipeline.store import density, event_files, leases, requests, seal, shard
 from tests.pace import patience
 from tests.pipeline.faults import crew
 from tests.pipeline.faults.effects import Effects, Tell
@@ -256,7 +256,7 @@ def set_up() -> None:
         "retry_timeout": timedelta(seconds=patience(0.5)),
         "backoff": {"init_backoff": timedelta(milliseconds=5)},
     }
-    remote.RETRIES |= retries
+    requests.RETRIES |= retries
     leases.POLL, leases.RENEWAL, leases.SILENCE = 0.02, 0.2, patience(3.0)  # a slow writer is not a dead one
 
 

@@ -25,7 +25,7 @@ from levelproof.pipeline.jobs import seal as jobs_seal
 from levelproof.pipeline.jobs import unit
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import failure
-from levelproof.pipeline.store import leases, leftovers, machine, publish, remote
+from levelproof.pipeline.store import leases, leftovers, machine, publish, remote, requests
 from levelproof.pipeline.store.checksums import has_own
 from levelproof.pipeline.store.event_files import KEPT, events_of, new_run, runs_in, write_events
 from levelproof.pipeline.store.layout import (
@@ -43,6 +43,7 @@ from levelproof.pipeline.store.locks import is_written
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.objects import get, put, remove, require_conditions
 from levelproof.pipeline.store.publish import ended
+from levelproof.pipeline.store.requests import obstore_module
 from levelproof.pipeline.store.seal import Piece, seal
 from levelproof.pipeline.store.split import locked
 from levelproof.pipeline.verify import verify
@@ -132,7 +133,7 @@ def test_store_gets_what_a_folder_gets(server: Server, here: Path, every: int, h
 
 
 def test_requests_to_a_slow_store_are_retried(server: Server, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(remote.PATIENCE, "timeout", timedelta(seconds=patience(0.5)))
+    monkeypatch.setitem(requests.PATIENCE, "timeout", timedelta(seconds=patience(0.5)))
     forget()
     server.spoil(25, "slow")
     drive(OUT)
@@ -151,7 +152,7 @@ def requests_of_a_run(server: Server) -> int:
     drive(OUT)
     server.meanwhile = lambda _: None
     count = server.count - before
-    remote.obstore_module().delete(remote.place(THERE)[0], [remote.place(path)[1] for path in remote.stored_in(THERE)])
+    obstore_module().delete(remote.place(THERE)[0], [remote.place(path)[1] for path in remote.stored_in(THERE)])
     forget()
     return count
 
@@ -161,10 +162,10 @@ def requests_of_a_run(server: Server) -> int:
 def test_generate_resumes_after_the_store_fails(
     server: Server, here: Path, monkeypatch: pytest.MonkeyPatch, some: int
 ) -> None:
-    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.2))
+    monkeypatch.setitem(requests.RETRIES, "retry_timeout", timedelta(seconds=0.2))
     monkeypatch.setattr(leases, "SILENCE", 0.1)
-    requests = requests_of_a_run(server)
-    for request in sorted(random.Random(some).sample(range(1, requests), some)):
+    whole_run = requests_of_a_run(server)
+    for request in sorted(random.Random(some).sample(range(1, whole_run), some)):
         dies_at(server, request)
         with pytest.raises(StoreFailure, match=r"^Cannot (read|write) s3://bucket/data.* \(it does not answer\)"):
             drive(OUT)
@@ -178,8 +179,8 @@ def test_generate_resumes_after_the_store_fails(
 
 @pytest.mark.campaign
 def test_generate_resumes_after_a_kill_at_any_request(server: Server, here: Path) -> None:
-    requests = requests_of_a_run(server)
-    for request in sorted(random.Random(0).sample(range(1, requests), 5)):
+    whole_run = requests_of_a_run(server)
+    for request in sorted(random.Random(0).sample(range(1, whole_run), 5)):
         begun = server.count
         words = [sys.executable, "-m", "tests.pipeline.driver", OUT]
         with subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
@@ -319,7 +320,7 @@ def test_commit_keeps_its_data_if_the_answer_is_lost_and_another_writer_takes_ov
 def test_seal_resumes_after_the_store_fails(
     server: Server, here: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.2))
+    monkeypatch.setitem(requests.RETRIES, "retry_timeout", timedelta(seconds=0.2))
     monkeypatch.setattr(leases, "SILENCE", 0.1)
     drive(OUT)
     count = server.count
@@ -513,7 +514,7 @@ def test_lease_of_a_dead_process_is_taken_at_once_on_its_machine_only(
 
 @pytest.mark.usefixtures("interruptible")
 def test_lease_survives_lost_responses_to_renewals(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.1))
+    monkeypatch.setitem(requests.RETRIES, "retry_timeout", timedelta(seconds=0.1))
     monkeypatch.setattr(leases, "RENEWAL", 0.05)
     try:
         lease = Lease(THERE, print)
@@ -660,7 +661,7 @@ def test_generate_refuses_a_store_without_preconditions(server: Server, tmp_path
 
 def test_require_conditions_reports_a_busy_store_as_busy(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever digits the name of the probe file contains."""
-    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.2))
+    monkeypatch.setitem(requests.RETRIES, "retry_timeout", timedelta(seconds=0.2))
     server.spoil(1)
     with pytest.raises(StoreFailure, match=r"Cannot write .*501 \(503 Service Unavailable\)"):
         require_conditions(THERE / ".job.json.501")

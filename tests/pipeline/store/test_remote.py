@@ -26,7 +26,7 @@ import levelproof
 from levelproof.experts.labels import Label
 from levelproof.pipeline.errors import Failure, LevelproofError, StoreFailure, UserError
 from levelproof.pipeline.read.rows import read_rows
-from levelproof.pipeline.store import event_files, hub, job_note, leases, remote
+from levelproof.pipeline.store import event_files, hub, job_note, leases, remote, requests
 from levelproof.pipeline.store.event_files import events_of
 from levelproof.pipeline.store.fields import same_bits
 from levelproof.pipeline.store.fragment import read_fragment
@@ -68,8 +68,8 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Use small pieces, an empty cache, short time-outs and no cached metadata."""
     monkeypatch.setenv("LEVELPROOF_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr(remote, "PIECE", PIECE)
-    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=patience(2)))
-    monkeypatch.setitem(remote.RETRIES, "backoff", {"init_backoff": timedelta(milliseconds=5)})
+    monkeypatch.setitem(requests.RETRIES, "retry_timeout", timedelta(seconds=patience(2)))
+    monkeypatch.setitem(requests.RETRIES, "backoff", {"init_backoff": timedelta(milliseconds=5)})
     monkeypatch.setattr(hub, "PAUSE", 0.005)
     for name in [name for name in os.environ if name.startswith(("AWS_", "HF_", "GOOGLE_"))]:
         monkeypatch.delenv(name)
@@ -240,7 +240,7 @@ def test_read_survives_throttling_and_cut_off_responses(bucket: Bucket, split: P
 
 def test_read_fails_in_bounded_time_when_the_store_dies(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = witnessed(S3)
-    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.5))
+    monkeypatch.setitem(requests.RETRIES, "retry_timeout", timedelta(seconds=0.5))
     remote._store.cache_clear()
     bucket.server.spoil(1)
     start = time.monotonic()

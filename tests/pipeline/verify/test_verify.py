@@ -20,7 +20,7 @@ from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.errors import Failure, StoreFailure
 from levelproof.pipeline.jobs import repair as repairing
-from levelproof.pipeline.store import fragment, remote
+from levelproof.pipeline.store import fragment, remote, requests
 from levelproof.pipeline.store import shard as shards
 from levelproof.pipeline.store.formats import VERSION_KEY
 from levelproof.pipeline.store.job_note import note_job
@@ -102,7 +102,7 @@ def test_examine_reports_a_failing_server_as_such_and_not_as_damage(
 ) -> None:
     """Whichever request fails."""
     write_index(split)
-    monkeypatch.setitem(remote.RETRIES, "retry_timeout", timedelta(seconds=0.2))
+    monkeypatch.setitem(requests.RETRIES, "retry_timeout", timedelta(seconds=0.2))
     remote._store.cache_clear()
     with serving(files_of(split.parent)) as server:
         for share in (1.0, 0.3, 0.5, 0.7, 0.95):
@@ -110,9 +110,9 @@ def test_examine_reports_a_failing_server_as_such_and_not_as_damage(
             monkeypatch.setattr(remote, "_cache", lambda cache=cache: cache)
             if share == 1.0:
                 assert not examine(Path(f"{server.url}/{split.name}")).sentences
-                requests = server.count
+                asked = server.count
                 continue
-            last = server.count + share * requests
+            last = server.count + share * asked
             server.meanwhile = lambda number, last=last: server.spoil(int(number > last))
             with pytest.raises(StoreFailure, match="503"):
                 examine(Path(f"{server.url}/{split.name}"))

@@ -1,0 +1,101 @@
+"""Requests to stores: how long they may take, which are repeated, and what is said of those that fail."""
+
+import random
+import re
+import time
+from collections.abc import Callable
+from datetime import timedelta
+from itertools import count
+from pathlib import Path
+from typing import Any, TypeVar
+
+from levelproof.pipeline.errors import LevelproofError, StoreFailure, UserError
+from levelproof.pipeline.urls import as_typed
+
+REQUESTS = 16  # concurrent
+STREAMED = 2**20  # bytes of a response that are taken at once
+RETRIES: dict[str, Any] = {
+    "max_retries": 8,  # of a request that is throttled, refused, cut off or not answered; with jitter
+    "retry_timeout": timedelta(seconds=60),
+    "backoff": {"init_backoff": timedelta(seconds=0.1), "max_backoff": timedelta(seconds=8), "base": 2},
+}
+PATIENCE = {"connect_timeout": timedelta(seconds=5), "timeout": timedelta(seconds=60), "allow_http": True}
+SIGN_IN = {
+    "s3:": "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for a public bucket",
+    "gs:": "set GOOGLE_APPLICATION_CREDENTIALS, or GOOGLE_SKIP_SIGNATURE=true for a public bucket",
+    "az:": "set AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY",
+    "hf:": "set HF_TOKEN, or run `hf auth login`",
+}
+# Patterns in obstore's messages about failed requests:
+STATUS = re.compile(r"status code: (\d{3}[A-Za-z ]*)")
+PASSING = re.compile(r"status code: (408|409|429|50[02-4])")
+NO_BUCKET = "NoSuchBucket"
+CUT_OFF, SILENT = "response body error", "HTTP error"  # a response ends early; no response arrives
+CLOUD = re.compile(r"latest/api/token|computeMetadata")  # endpoints where a cloud's machines get credentials
+
+T = TypeVar("T")
+
+
+def obstore_module() -> Any:
+    try:
+        import obstore.exceptions
+        import obstore.store
+    except ImportError:
+        raise UserError(
+            'Reading splits that are not on this machine needs obstore: run `pip install -e ".[remote]"` in the clone.'
+        ) from None
+    return obstore
+
+
+def data_of(answer: Any, most: float) -> bytes:
+    """Read the bytes of a response; stop soon after `most`, so that the caller sees that it is too long."""
+    data = bytearray()
+    for part in answer.stream(min_chunk_size=STREAMED):
+        data += part
+        if len(data) > most:
+            break
+    return bytes(data)
+
+
+def ask(path: Path, request: Callable[[], T], what: str = "read") -> T:
+    """Make a request, and retry it if the response is cut off or missing, in cases that obstore does not retry.
+
+    obstore seldom retries cut-off responses, and never requests that it does not know to be idempotent.
+
+    Raises:
+        FileNotFoundError: the store has no such file.
+        UserError: it has no such bucket, or does not allow us to `what`.
+        StoreFailure: it does not answer.
+    """
+    exceptions, end = obstore_module().exceptions, time.monotonic() + RETRIES["retry_timeout"].total_seconds()
+    for attempt in count():
+        try:
+            return request()
+        except FileNotFoundError as error:
+            if NO_BUCKET in str(error):
+                raise _explained(path, str(error), what) from None
+            raise FileNotFoundError(as_typed(path)) from None
+        except exceptions.BaseError as error:
+            text = str(error)
+            passing = CUT_OFF in text or SILENT in text or PASSING.search(text)
+            if not passing or CLOUD.search(text) or time.monotonic() > end:
+                raise _explained(path, text, what) from None
+            time.sleep(random.uniform(0, min(0.1 * 2**attempt, 5)))
+    raise AssertionError("unreachable")
+
+
+def _explained(path: Path, text: str, what: str) -> LevelproofError:
+    """Turn obstore's message about a failed request into a sentence."""
+    url, how = as_typed(path), SIGN_IN.get(path.parts[0], "copy the split to a folder first")
+    if NO_BUCKET in text:
+        return UserError(f"There is no bucket {path.parts[1]!r}: check {url}.")
+    if CLOUD.search(text):
+        return UserError(f"There are no credentials to {what} {url}: {how}.")
+    if "Range request not supported" in text:
+        return StoreFailure(f"The server of {url} does not support range requests: copy the split to a folder first.")
+    status = STATUS.search(text)
+    reason = status[1].strip() if status else "it does not answer" if SILENT in text else text.splitlines()[0]
+    if reason.startswith(("401", "403")):
+        return UserError(f"The store does not let you {what} {url} ({reason}): {how}.")
+    then = "run the same command again; what is committed stays" if what == "write" else "try again"
+    return StoreFailure(f"Cannot {what} {url} ({reason}): check the network and the URL, and {then}.")
