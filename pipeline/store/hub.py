@@ -58,15 +58,17 @@ def sign_in() -> dict[str, Any]:
     return {"default_headers": {"authorization": f"Bearer {token.strip()}"}} if token.strip() else {}
 
 
-def files_below(repository: Repository, folder: str) -> dict[str, tuple[str, int]]:
+def files_below(repository: Repository, folder: str, deep: bool = True) -> dict[str, tuple[str, int]]:
     """Return the hash and the size in bytes of every file below a folder (empty: all); none if it does not exist.
+
+    Without `deep`, leave out the files of its folders.
 
     Raises:
         UserError: the repository does not exist, or may not be read.
         StoreFailure: the hub does not answer.
     """
     place = quote(repository.revision, safe="") + (f"/{quote(folder)}" if folder else "")
-    url = f"{_endpoint()}/api/datasets/{repository.name}/tree/{place}?recursive=true"
+    url = f"{_endpoint()}/api/datasets/{repository.name}/tree/{place}?recursive={str(deep).lower()}"
     listed: dict[str, tuple[str, int]] = {}
     while url:
         files, url = _page(url)

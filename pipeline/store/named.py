@@ -5,7 +5,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from levelproof.pipeline.store.layout import data_path
-from levelproof.pipeline.store.remote import RemoteFile, is_remote
+from levelproof.pipeline.store.remote import is_remote, stored_at
 from levelproof.pipeline.store.seed.file import file_of, is_seed, written
 from levelproof.pipeline.store.seed.shard import SeedShard
 from levelproof.pipeline.store.shard import Shard, stored_bytes
@@ -20,7 +20,7 @@ def open_shard(split: Path, name: str, size: str) -> Shard:
     if not is_seed(split):
         return Shard(data_path(split, name), size)
     file = file_of(split, name)
-    return _seed_shard(file, size, written(file))
+    return _seed_shard(file, size, stored_at(file) if is_remote(file) else written(file))
 
 
 def bytes_named(split: Path, names: Iterable[str]) -> int:
@@ -31,10 +31,10 @@ def bytes_named(split: Path, names: Iterable[str]) -> int:
 
 
 @lru_cache(maxsize=2)
-def _seed_shard(file: Path, size: str, _: tuple[int, ...] | None) -> SeedShard:
+def _seed_shard(file: Path, size: str, _: tuple | None) -> SeedShard:
     """Open a seed file once until it is `written` again: exports read its rows a block at a time."""
     return SeedShard(file, size)
 
 
 def _bytes_of(file: Path) -> int:
-    return RemoteFile(file).size if is_remote(file) else file.stat().st_size
+    return stored_at(file).size if is_remote(file) else file.stat().st_size

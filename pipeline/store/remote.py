@@ -27,6 +27,7 @@ INDEX = "index.txt"  # in the manifest's folder: names of the fragments, for ser
 MAX_INDEX = 2**25  # bytes of it; a name takes 34
 PIECE = 2**20  # bytes; with 4 MB, random reads of 10 kB trajectories would fetch four times as much
 MAX_PIECES = 8  # adjacent pieces that one request fetches
+LISTED = "manifest", "experts"  # folders of a split whose files are looked up together
 MAX_WHOLE = 2**29  # bytes of a file that is read as a whole, such as a fragment
 CACHE_GB = "LEVELPROOF_CACHE_GB"
 COPY = {"s3:": "aws s3 sync", "gs:": "gcloud storage rsync -r", "az:": "azcopy sync", "hf:": "hf download"}
@@ -157,7 +158,7 @@ class RemoteFile:
             FileNotFoundError: there is no such file.
             UserError, StoreFailure: as `stored_in`.
         """
-        self.path, self._about = path, _look_up(path)
+        self.path, self._about = path, stored_at(path)
         self.size = self._about.size
         names = f"{as_typed(path)}\n{self._about.tag}\n{self.size}\n{PIECE}"
         self._name, self._cache = sha256(names.encode()).hexdigest()[:32], _cache()
@@ -205,7 +206,8 @@ class RemoteFile:
         about, data = ask(self.path, request)
         tag = self._about.tag if self.path.parts[0] in HUB else _tag(about)  # the hub's file servers use other tags
         if (tag, about["size"], len(data)) != (*self._about, last - first):
-            _known.pop(_folder_of(self.path), None)
+            if folder := _folder_of(self.path):
+                _known.pop(folder, None)
             raise FileChanged(f"{as_typed(self.path)} has changed")
         for i, n in enumerate(run):
             self._cache.put(self._piece(n), data[i * PIECE : (i + 1) * PIECE])
@@ -215,23 +217,41 @@ class RemoteFile:
 _known: dict[Path, dict[Path, Stored]] = {}  # by folder: metadata of looked-up or listed files
 
 
-def _folder_of(path: Path) -> Path:
-    """Return the folder to list for a file's metadata: its shard, or its parent."""
-    return next((folder for folder in path.parents if folder.suffix == ".zarr"), path.parent)
+def _folder_of(path: Path) -> Path | None:
+    """Return the folder to list for a file's metadata: its shard, or a split's folder; None: it is in neither."""
+    shard = next((folder for folder in path.parents if folder.suffix == ".zarr"), None)
+    return shard or (path.parent if path.parent.name in LISTED else None)
 
 
-def _look_up(path: Path) -> Stored:
+def stored_at(path: Path) -> Stored:
+    """Return a file's metadata: as listed with its shard or fragment, otherwise as the store has it now.
+
+    Raises: as `RemoteFile`.
+    """
     folder = _folder_of(path)
+    if folder is None:
+        return _asked(path)
     files = _known.get(folder)
     if files is None:
-        files = _known[folder] = {} if path.parts[0] in WEB else stored_in(folder)
-    if path not in files and path.parts[0] in WEB:
-        store, key = place(path)
-        about = ask(path, lambda: obstore_module().head(store, key))
-        files[path] = Stored(_tag(about), about["size"])
+        files = _known[folder] = stored_in(folder) if is_listed(path) else {}
+    if path not in files and not is_listed(path):
+        files[path] = _asked(path)
     if path not in files:
         raise FileNotFoundError(as_typed(path))
     return files[path]
+
+
+def _asked(path: Path) -> Stored:
+    """Ask for a file's metadata without a list: there may be any number of files beside it, or no right to list."""
+    store, key = place(path)
+    if path.parts[0] in HUB:  # it answers requests for a file with a redirect, whose target has another tag
+        repository, key = hub.split_url(path.parts[1:])
+        listed = hub.files_below(repository, key.rpartition("/")[0], deep=False)
+        if key not in listed:
+            raise FileNotFoundError(as_typed(path))
+        return Stored(*listed[key])
+    about = ask(path, lambda: obstore_module().head(store, key))
+    return Stored(_tag(about), about["size"])
 
 
 def _tag(about: Any) -> str:

@@ -276,7 +276,8 @@ def hub_of(folder: Path, dataset: str, token: str, page: int, revision: str = "m
             return Answer(404, {}, b"{}")
         asked = urlsplit(path)
         place = folder / asked.path.removeprefix(listed).lstrip("/")
-        below = [file for file in sorted(place.rglob("*")) if file.is_file()]
+        deep = "recursive=true" in asked.query
+        below = [file for file in sorted(place.rglob("*") if deep else place.glob("*")) if file.is_file()]
         first = int((re.findall(r"cursor=(\d+)", asked.query) or ["0"])[0])
         entries = [
             {
@@ -287,7 +288,7 @@ def hub_of(folder: Path, dataset: str, token: str, page: int, revision: str = "m
             }
             for file in below[first : first + page]
         ]
-        more = f'<http://{headers["host"]}{asked.path}?recursive=true&cursor={first + page}>; rel="next"'
+        more = f'<http://{headers["host"]}{asked.path}?recursive={str(deep).lower()}&cursor={first + page}>; rel="next"'
         return Answer(200, {"Link": more} if first + page < len(below) else {}, json.dumps(entries).encode())
 
     return answers

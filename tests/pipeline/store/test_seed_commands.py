@@ -18,6 +18,7 @@ from levelproof.levelgen.identity.content import content_hashes
 from levelproof.pipeline.exchange.seed import export_seed
 from levelproof.pipeline.look import card as cards
 from levelproof.pipeline.store.manifest import read_manifest, write_index
+from levelproof.pipeline.store.named import open_shard
 from levelproof.pipeline.store.seed.columns import CONTENT_KEY, SCHEMA, WRITTEN
 from levelproof.pipeline.store.seed.packed import ENTRIES
 from levelproof.pipeline.store.seed.rows import COSTS
@@ -276,18 +277,34 @@ def test_card_of_a_split_in_a_store_is_that_of_its_folder(
     assert written[0] == written[1] == written[2]
 
 
-def test_seed_file_at_the_root_of_a_store_opens(seed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "store/bucket").mkdir(parents=True)
-    shutil.copy(seed, tmp_path / "store/bucket/levels.parquet")
-    fingerprint = levelproof.open(seed).fingerprint
+def test_seed_file_at_the_root_of_a_store_opens_without_a_list_and_anew(
+    seed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside it there may be any number of files, and users may be allowed to read, but not to list."""
+    bucket = tmp_path / "store/bucket"
+    bucket.mkdir(parents=True)
+    unlike = lambda columns, _: columns["checksum"].__setitem__(solved(seed), columns["checksum"][solved(seed)] ^ 1)
+    versions = [seed, forged(seed, tmp_path / "other.parquet", unlike)]
+
+    def require_each_version_read(url: str) -> None:
+        for version in versions:
+            shutil.copy(version, bucket / "levels.parquet")
+            assert levelproof.open(url).fingerprint == levelproof.open(version).fingerprint
+            there, here = (open_shard(place, "levels.parquet", "s") for place in (Path(url), version))
+            assert there.checksum.tolist() == here.checksum.tolist()  # pyright: ignore[reportAttributeAccessIssue]
+
     with serving(bucket_of(tmp_path / "store")) as server:
         for name, value in {**KEYS, "ENDPOINT_URL": server.url}.items():
             monkeypatch.setenv(f"AWS_{name}", value)
-        assert levelproof.open("s3://bucket/levels.parquet").fingerprint == fingerprint
-    with serving(hub_of(tmp_path / "store/bucket", "user/name", "secret", page=2)) as server:
+        require_each_version_read("s3://bucket/levels.parquet")
+        assert not [line for line in server.log if "list-type" in line]
+    with serving(files_of(bucket)) as server:
+        require_each_version_read(f"{server.url}/levels.parquet")
+    with serving(hub_of(bucket, "user/name", "secret", page=2)) as server:
         monkeypatch.setenv("HF_ENDPOINT", server.url)
         monkeypatch.setenv("HF_TOKEN", "secret")
-        assert levelproof.open("hf://datasets/user/name/levels.parquet").fingerprint == fingerprint
+        require_each_version_read("hf://datasets/user/name/levels.parquet")
+        assert not [line for line in server.log if "recursive=true" in line]
 
 
 @pytest.mark.campaign
