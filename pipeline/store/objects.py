@@ -9,14 +9,15 @@ from contextlib import suppress
 from functools import partial
 from math import inf
 from pathlib import Path
+from threading import BoundedSemaphore
 from typing import Any, NamedTuple
 
 from levelproof.pipeline.errors import StoreFailure, UserError
 from levelproof.pipeline.store.remote import place
-from levelproof.pipeline.store.requests import ask, data_of, obstore_module
+from levelproof.pipeline.store.requests import MUCH, SEND_TURN, ask, data_of, obstore_module
 from levelproof.pipeline.urls import BUCKETS, as_typed
 
-PART = 2**25  # bytes; larger files are sent in parts
+PART = 2**23  # bytes; larger files are sent in parts, one after another
 
 
 class Version(NamedTuple):
@@ -75,8 +76,15 @@ def begin_of(path: Path, most: int) -> tuple[bytes, int]:
 
 def put(path: Path, data: bytes | Path) -> None:
     """Write bytes, or a file of this machine, to `path`, replacing any file there. Raises as `get`."""
-    store, key = place(path)
-    ask(path, lambda: obstore_module().put(store, key, data, chunk_size=PART), "write")
+    size = data.stat().st_size if isinstance(data, Path) else len(data)
+    store, key = place(path, size)
+    send = lambda: obstore_module().put(store, key, data, chunk_size=PART, max_concurrency=1)
+    ask(path, send, "write", _turn(size))
+
+
+def _turn(size: int) -> BoundedSemaphore | None:
+    """Return what a request that sends this many bytes waits for."""
+    return SEND_TURN if size > MUCH else None
 
 
 def put_if(path: Path, data: bytes, there: Version | None) -> Version | None:
@@ -87,7 +95,7 @@ def put_if(path: Path, data: bytes, there: Version | None) -> Version | None:
 
     Raises: as `get`.
     """
-    (store, key), obstore = place(path), obstore_module()
+    (store, key), obstore = place(path, len(data)), obstore_module()
     refusals = (obstore.exceptions.AlreadyExistsError, obstore.exceptions.PreconditionError)
 
     def request() -> Version | None:
@@ -97,7 +105,7 @@ def put_if(path: Path, data: bytes, there: Version | None) -> Version | None:
             return None
 
     try:
-        if made := ask(path, request, "write"):
+        if made := ask(path, request, "write", _turn(len(data))):
             return made
         now = get(path)
     except FileNotFoundError:

@@ -17,7 +17,18 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.runtime import cache_folder
 from levelproof.pipeline.store import hub
 from levelproof.pipeline.store.pieces import PieceCache
-from levelproof.pipeline.store.requests import PATIENCE, REQUESTS, RETRIES, ask, data_of, obstore_module
+from levelproof.pipeline.store.requests import (
+    MUCH,
+    PATIENCE,
+    RECEIVE_TURN,
+    REQUESTS,
+    RESENDING,
+    RETRIES,
+    SENDING,
+    ask,
+    data_of,
+    obstore_module,
+)
 from levelproof.pipeline.urls import BUCKETS, HUB, WEB, as_typed, is_remote
 
 if TYPE_CHECKING:
@@ -203,7 +214,7 @@ class RemoteFile:
             answer = obstore_module().get(store, key, options=options)
             return answer.meta, data_of(answer, last - first)
 
-        about, data = ask(self.path, request)
+        about, data = ask(self.path, request, turn=RECEIVE_TURN)
         tag = self._about.tag if self.path.parts[0] in HUB else _tag(about)  # the hub's file servers use other tags
         if (tag, about["size"], len(data)) != (*self._about, last - first):
             if folder := _folder_of(self.path):
@@ -270,8 +281,8 @@ def _runs(numbers: Iterable[int]) -> list[list[int]]:
     return runs
 
 
-def place(path: Path) -> tuple["ObjectStore", str]:
-    """Return the store that a path is in, and its key there."""
+def place(path: Path, sent: int = 0) -> tuple["ObjectStore", str]:
+    """Return the store that a path is in, for a request that sends this many bytes, and its key there."""
     _require_own_process()
     if path.parts[0] in HUB:
         repository, key = hub.split_url(path.parts[1:])
@@ -279,16 +290,18 @@ def place(path: Path) -> tuple["ObjectStore", str]:
     if len(path.parts) < 2:
         raise UserError(f"The URL {as_typed(path)} names no split: give one such as s3://bucket/data/128k/s.")
     key = "/".join(path.parts[2:])  # obstore quotes it in requests, and would quote a URL's %20 twice
-    return _store(path.parts[0], path.parts[1]), unquote(key) if path.parts[0] in WEB else key
+    return _store(path.parts[0], path.parts[1], sent > MUCH), unquote(key) if path.parts[0] in WEB else key
 
 
 @lru_cache(maxsize=64)
-def _store(scheme: str, root: Any) -> "ObjectStore":
-    url, options = f"{scheme}//{root}", PATIENCE
+def _store(scheme: str, root: Any, sends_much: bool = False) -> "ObjectStore":
+    url, options, retries = f"{scheme}//{root}", PATIENCE, RETRIES
+    if sends_much:
+        options, retries = options | {"read_timeout": SENDING}, retries | {"retry_timeout": RESENDING}
     if scheme in HUB:
-        url, options = hub.resolve_url(root), PATIENCE | hub.sign_in()
+        url, options = hub.resolve_url(root), options | hub.sign_in()
     make = obstore_module().store.from_url if scheme in BUCKETS else obstore_module().store.HTTPStore
-    return make(url, client_options=options, retry_config=RETRIES)
+    return make(url, client_options=options, retry_config=retries)
 
 
 @lru_cache(maxsize=1)

@@ -4,22 +4,37 @@ import random
 import re
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from datetime import timedelta
 from itertools import count
 from pathlib import Path
+from threading import BoundedSemaphore
 from typing import Any, TypeVar
 
 from levelproof.pipeline.errors import LevelproofError, StoreFailure, UserError
 from levelproof.pipeline.urls import as_typed
 
 REQUESTS = 16  # concurrent
+SENDS = 4  # concurrent requests that send much: a slow link must send all of them before SENDING ends
+RECEIVE_TURN, SEND_TURN = BoundedSemaphore(REQUESTS), BoundedSemaphore(SENDS)  # of this process
+MUCH = 2**20  # bytes of a request that waits for its turn to send
 STREAMED = 2**20  # bytes of a response that are taken at once
 RETRIES: dict[str, Any] = {
     "max_retries": 8,  # of a request that is throttled, refused, cut off or not answered; with jitter
     "retry_timeout": timedelta(seconds=60),
     "backoff": {"init_backoff": timedelta(seconds=0.1), "max_backoff": timedelta(seconds=8), "base": 2},
 }
-PATIENCE = {"connect_timeout": timedelta(seconds=5), "timeout": timedelta(seconds=60), "allow_http": True}
+TRIES = 3  # at least, however long each takes
+# A slow link is not an error, but silence is: `timeout` limits a whole request, `read_timeout` the wait for its next
+# bytes. Until the first of these, that wait includes the time that it takes to send the request
+PATIENCE = {
+    "connect_timeout": timedelta(seconds=5),
+    "read_timeout": timedelta(seconds=60),
+    "timeout": timedelta(hours=6),
+    "allow_http": True,
+}
+SENDING = timedelta(minutes=10)  # `read_timeout` of requests that send much
+RESENDING = timedelta(minutes=5)  # their `retry_timeout`: obstore signs them once, and signatures expire
 SIGN_IN = {
     "s3:": "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for a public bucket",
     "gs:": "set GOOGLE_APPLICATION_CREDENTIALS, or GOOGLE_SKIP_SIGNATURE=true for a public bucket",
@@ -57,10 +72,11 @@ def data_of(answer: Any, most: float) -> bytes:
     return bytes(data)
 
 
-def ask(path: Path, request: Callable[[], T], what: str = "read") -> T:
+def ask(path: Path, request: Callable[[], T], what: str = "read", turn: AbstractContextManager[Any] | None = None) -> T:
     """Make a request, and retry it if the response is cut off or missing, in cases that obstore does not retry.
 
-    obstore seldom retries cut-off responses, and never requests that it does not know to be idempotent.
+    obstore seldom retries cut-off responses, and never requests that it does not know to be idempotent. `turn` is
+    RECEIVE_TURN or SEND_TURN for requests with much data; others, such as those that renew a lease, wait for none.
 
     Raises:
         FileNotFoundError: the store has no such file.
@@ -70,7 +86,8 @@ def ask(path: Path, request: Callable[[], T], what: str = "read") -> T:
     exceptions, end = obstore_module().exceptions, time.monotonic() + RETRIES["retry_timeout"].total_seconds()
     for attempt in count():
         try:
-            return request()
+            with turn or nullcontext():
+                return request()
         except FileNotFoundError as error:
             if NO_BUCKET in str(error):
                 raise _explained(path, str(error), what) from None
@@ -78,7 +95,7 @@ def ask(path: Path, request: Callable[[], T], what: str = "read") -> T:
         except exceptions.BaseError as error:
             text = str(error)
             passing = CUT_OFF in text or SILENT in text or PASSING.search(text)
-            if not passing or CLOUD.search(text) or time.monotonic() > end:
+            if not passing or CLOUD.search(text) or (attempt + 1 >= TRIES and time.monotonic() > end):
                 raise _explained(path, text, what) from None
             time.sleep(random.uniform(0, min(0.1 * 2**attempt, 5)))
     raise AssertionError("unreachable")

@@ -33,6 +33,7 @@ AZURE_NAME, AZURE_VERSION = "devstoreaccount1", "2021-08-06"
 AZURE_KEY = "Eby8vdM02xNOcqFlqUwJPLlmEtlCDXJ1OUzFT50uSRZ6IFsuFq2UVErCz4I6tq/K1SZFPTOtr/KBHBeksoGMGw=="
 PAGE = 10  # keys per page of S3's lists
 SLOW = 1.0  # s
+DRIPS = 10  # parts of an answer that comes slowly
 
 
 KEPT = ("etag", "last-modified", "content-range", "content-length", "content-type")  # headers that stores' clients read
@@ -47,12 +48,29 @@ class Answer(NamedTuple):
 Answers = Callable[[str, str, dict[str, str], bytes], Answer]  # gets a method, a path, the request's headers and body
 
 
+class Crowd:
+    """Counts the blocks that run at the same time."""
+
+    def __init__(self) -> None:
+        self.now, self.most, self._lock = 0, 0, Lock()
+
+    def __enter__(self) -> None:
+        with self._lock:
+            self.now += 1
+            self.most = max(self.most, self.now)
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self.now -= 1
+
+
 class Server:
     """HTTP server that answers requests by a function, logs them, and spoils every n-th answer on request."""
 
     def __init__(self, answers: Answers) -> None:
         self.log: list[str] = []  # "GET /path bytes=0-99"
         self.count, self.every, self.spoiled = 0, 0, "busy"
+        self.crowd = Crowd()
         self.meanwhile: Callable[[int], object] = lambda _: None  # gets the number of each request
         server = self
 
@@ -60,35 +78,45 @@ class Server:
             protocol_version = "HTTP/1.1"
 
             def answer(self) -> None:
+                with server.crowd:
+                    given, how = self.answered()
+                if given is None:
+                    self.close_connection = True
+                    return
+                self.give(given, how)
+
+            def answered(self) -> tuple[Answer | None, str]:
+                """Return the answer (None: drop the connection), and how it is spoiled."""
                 server.count += 1
                 server.log.append(f"{self.command} {self.path} {self.headers.get('Range', '')}".strip())
                 server.meanwhile(server.count)
-                spoiled = server.spoiled if server.every and server.count % server.every == 0 else ""
+                how = server.spoiled if server.every and server.count % server.every == 0 else ""
                 headers = {name.lower(): x for name, x in self.headers.items()}
                 length = int(headers.get("content-length", 0))
                 body = self.rfile.read(length)
                 if len(body) < length:  # the client died while sending it
-                    self.close_connection = True
-                    return
-                if spoiled == "busy":
-                    self.give(Answer(503, {}, b"<Error><Code>SlowDown</Code></Error>"))
-                    return
-                if spoiled == "slow":
+                    return None, how
+                if how == "busy":
+                    return Answer(503, {}, b"<Error><Code>SlowDown</Code></Error>"), ""
+                if how == "slow":
                     time.sleep(patience(SLOW))
-                given = answers(self.command, self.path, headers, body) if spoiled != "gone" else None
-                if given is None or spoiled == "lost":  # drop the connection, before or after executing the request
-                    self.close_connection = True
-                    return
-                self.give(given, cut_off=spoiled == "cut")
+                given = answers(self.command, self.path, headers, body) if how != "gone" else None
+                return None if how == "lost" else given, how  # before or after executing the request
 
-            def give(self, given: Answer, cut_off: bool = False) -> None:
+            def give(self, given: Answer, how: str) -> None:
                 self.send_response(given.status)
                 for name, value in {"Content-Length": str(len(given.body)), **given.headers}.items():
                     self.send_header(name, value)
                 self.end_headers()
-                if self.command != "HEAD":
-                    self.wfile.write(given.body[: len(given.body) // 2] if cut_off else given.body)
-                if cut_off:
+                if self.command == "HEAD":
+                    return
+                size = len(given.body) // (2 if how == "cut" else 1)
+                step = -(-size // DRIPS) if how == "dripping" else size
+                for first in range(0, size, step or 1):
+                    self.wfile.write(given.body[first : min(first + step, size)])
+                    if how == "dripping":
+                        time.sleep(patience(SLOW) / DRIPS)
+                if how == "cut":
                     self.close_connection = True
 
             do_GET = do_HEAD = do_PUT = do_DELETE = do_POST = answer  # noqa: N815
@@ -110,8 +138,8 @@ class Server:
 
         Args:
             every: n; 0: spoil none.
-            how: "busy": answer 503; "cut": send half the answer; "slow": answer late; "lost": execute the request, then
-                drop the connection; "gone": drop the connection at once.
+            how: "busy": answer 503; "cut": send half the answer; "slow": answer late; "dripping": answer slowly;
+                "lost": execute the request, then drop the connection; "gone": drop the connection at once.
         """
         self.every, self.spoiled = every, how
 

@@ -133,12 +133,29 @@ def test_store_gets_what_a_folder_gets(server: Server, here: Path, every: int, h
 
 
 def test_requests_to_a_slow_store_are_retried(server: Server, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(requests.PATIENCE, "timeout", timedelta(seconds=patience(0.5)))
+    monkeypatch.setitem(requests.PATIENCE, "read_timeout", timedelta(seconds=patience(0.5)))
     forget()
     server.spoil(25, "slow")
     drive(OUT)
     server.spoil(0)
     require_whole(here)
+
+
+def test_large_files_are_sent_a_few_at_a_time_and_may_take_long(
+    server: Server, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The limit of silence of other requests would include the time that it takes to send them."""
+    monkeypatch.setitem(requests.PATIENCE, "read_timeout", timedelta(seconds=patience(0.5)))
+    forget()
+    (tmp_path / "file").write_bytes(bytes(requests.MUCH + 1))
+    server.meanwhile = lambda _: time.sleep(0.1)
+    count = 2 * requests.SENDS
+    remote.at_once(THERE, put, [THERE / f"shards/{i}" for i in range(count)], [tmp_path / "file"] * count)
+    assert server.crowd.most == requests.SENDS
+    server.spoil(1, "slow")
+    count = server.count
+    put(THERE / "shards/0", tmp_path / "file")
+    assert server.count == count + 1
 
 
 def dies_at(server: Server, request: int) -> None:

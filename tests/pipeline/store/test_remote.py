@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from datetime import timedelta
 from itertools import count
 from pathlib import Path
@@ -34,12 +35,13 @@ from levelproof.pipeline.store.job_note import NoteError, note_job, read_note
 from levelproof.pipeline.store.layout import FRAGMENT, MANIFEST, WRITER_LOCK, entries
 from levelproof.pipeline.store.leases import is_leased
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, require_manifest, write_index
-from tests.pace import patience
+from tests.pace import patience, wait_until
 from tests.pipeline.command import ROOT, assert_refused, line_of
 from tests.pipeline.command import here as command
 from tests.pipeline.made import made_job, made_split, played_split
 from tests.pipeline.servers import (
     HOST,
+    SLOW,
     Answer,
     Server,
     before,
@@ -236,6 +238,41 @@ def test_fragment_that_was_replaced_since_it_was_listed_is_missing(bucket: Bucke
 def test_read_survives_throttling_and_cut_off_responses(bucket: Bucket, split: Path, how: str) -> None:
     bucket.server.spoil(3, how)
     require_same(S3, split)
+
+
+def test_read_waits_for_slow_bytes_but_not_in_silence(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A link of 10 kB/s has the time to answer all requests that run together."""
+    together = requests.REQUESTS * remote.MAX_PIECES * 2**20
+    assert requests.PATIENCE["timeout"] > timedelta(seconds=together / 1e4)
+    bucket.put("data/s/shards/x", bytes(PIECE))
+    monkeypatch.setitem(requests.PATIENCE, "read_timeout", timedelta(seconds=patience(SLOW / 2)))
+    monkeypatch.setitem(requests.RETRIES, "retry_timeout", timedelta(seconds=0.2))
+    remote._store.cache_clear()
+    for how, failures in (("dripping", 0), ("slow", requests.TRIES)):
+        file, count = remote.RemoteFile(S3 / "shards/x"), bucket.server.count
+        file._name = how  # in the cache
+        bucket.server.spoil(1, how)
+        with pytest.raises(StoreFailure, match="it does not answer") if failures else nullcontext():
+            assert next(file.read([(0, PIECE)])) == bytes(PIECE)
+        assert bucket.server.count >= count + max(failures, 1)
+        bucket.server.spoil(0)
+
+
+def test_reads_within_reads_share_one_limit_of_requests(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remote, "MAX_PIECES", 1)
+    keys = [f"data/s/shards/{i}" for i in range(10)]
+    for i, key in enumerate(keys):
+        bucket.put(key, bytes([i]) * 8 * PIECE)
+    files = [remote.RemoteFile(Path("s3://bucket") / key) for key in keys]
+    wait_until(lambda: not bucket.server.crowd.now, 60, "requests of another test")
+    bucket.server.meanwhile = lambda _: time.sleep(0.1)
+    bucket.server.crowd.most = 0
+    try:
+        read = remote.at_once(S3, lambda file: next(file.read([(0, 8 * PIECE)])), files)
+    finally:
+        bucket.server.meanwhile = lambda _: None
+    assert [set(data) for data in read] == [{i} for i in range(10)]
+    assert bucket.server.crowd.most <= requests.REQUESTS
 
 
 def test_read_fails_in_bounded_time_when_the_store_dies(bucket: Bucket, monkeypatch: pytest.MonkeyPatch) -> None:
