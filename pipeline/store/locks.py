@@ -96,6 +96,7 @@ def committing(split: Path) -> Iterator[Path]:
         with publishing(split) as folder:
             yield folder
         return
+    require_served(split)  # also here, because the folder may be gone
     with open(split / COMMIT_LOCK, "a+", opener=regular) as file:
         _take(file, fcntl.LOCK_SH)
         require_served(split)

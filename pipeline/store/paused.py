@@ -86,8 +86,6 @@ def save_paused(split: Path, unit: str, paused: Mapping[int, Paused], job: JobCo
         arrays |= arrays_of(stacked(trees), "evaluation/")
     file, path = io.BytesIO(), checkpoint_path(split, unit)
     np.savez(file, allow_pickle=False, **arrays)
-    if not is_remote(split):
-        path.parent.mkdir(parents=True, exist_ok=True)
     archive = file.getvalue()
     head = {
         "levels": sorted(paused),
@@ -96,6 +94,8 @@ def save_paused(split: Path, unit: str, paused: Mapping[int, Paused], job: JobCo
         "sha256": hashlib.sha256(archive).hexdigest(),
     }
     require_served(split)  # the next writer's workers save experts under the same names
+    if not is_remote(split):
+        path.parent.mkdir(exist_ok=True)
     write(path, MAGIC + f"{VERSION} {json.dumps(head)}\n".encode() + archive, OWN)
 
 

@@ -14,6 +14,7 @@ from levelproof.pipeline.errors import LevelproofError
 from levelproof.pipeline.store import objects
 from levelproof.pipeline.store.files import remove, write
 from levelproof.pipeline.store.layout import NOTE, QUARANTINE, entries, ids_of, quarantine_path, unit_name
+from levelproof.pipeline.store.leases import require_served
 from levelproof.pipeline.store.remote import at_once, is_remote
 from levelproof.pipeline.store.runs import runs, without
 
@@ -22,7 +23,13 @@ LEVELS = re.compile(r"Levels: ([0-9]{1,12}-[0-9]{1,12}(?:, [0-9]{1,12}-[0-9]{1,1
 
 
 def give_up(split: Path, level_ids: Sequence[int], reason: str) -> None:
-    """Note why these levels (ascending) were given up. Raises as `files.write`."""
+    """Note why these levels (ascending) were given up.
+
+    Raises:
+        LeaseLost: this process works for a writer that no longer has the split.
+        OSError, UserError, StoreFailure: as `files.write`.
+    """
+    require_served(split)
     note = quarantine_path(split, unit_name(level_ids[0], level_ids[-1]))
     if not is_remote(split):
         note.parent.mkdir(exist_ok=True)

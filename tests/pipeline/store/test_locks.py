@@ -28,6 +28,7 @@ from levelproof.pipeline.store.locks import (
     only_writer,
     without_commits,
 )
+from levelproof.pipeline.store.quarantine import give_up
 from levelproof.pipeline.store.split import writing
 from tests.pace import patience
 from tests.pipeline.command import ROOT, heed_ctrl_c, line_of, start
@@ -57,6 +58,19 @@ def test_committing_refuses_workers_of_an_earlier_writer(tmp_path: Path, monkeyp
                 pass
         shutil.rmtree(tmp_path)
         tmp_path.mkdir()
+
+
+def test_removed_folder_of_a_split_is_lost_and_not_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(leases, "_served", {})
+    split = tmp_path / "s"
+    split.mkdir()
+    with only_writer(split, print):
+        shutil.rmtree(split)
+        with pytest.raises(LeaseLost, match="or its folder was removed"), committing(split):
+            pytest.fail("it would commit")
+        with pytest.raises(LeaseLost):
+            give_up(split, (3, 4), "Failed 3 times")
+    assert not split.exists()
 
 
 def test_only_trainer_notices_that_its_folder_was_recreated(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -129,7 +130,11 @@ def test_save_replaces_no_checkpoint_for_an_earlier_writer(split: Path, kept: di
         same(load_paused(split, range(8), JOB), kept)
         serve(split, now)
         save_paused(split, UNIT, {3: kept[3]}, JOB)
-    assert load_paused(split, range(8), JOB).keys() == {3}
+        assert load_paused(split, range(8), JOB).keys() == {3}
+        shutil.rmtree(split)
+        with pytest.raises(LeaseLost):
+            save_paused(split, UNIT, {3: kept[3]}, JOB)
+        assert not split.exists()
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="the system has no such users")
