@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow.compute as pc
 from rich.console import Console
 
-from levelproof.configs.schema import JobConfig
+from levelproof.configs.schema import GrowConfig, JobConfig
 from levelproof.experts.labels import Label
 from levelproof.experts.steps import EnvSteps
 from levelproof.pipeline.errors import Exit, Failure, UserError
@@ -31,7 +31,7 @@ from levelproof.pipeline.store.manifest import Manifest, read_manifest
 from levelproof.pipeline.store.origins import Origin, require_same_levels
 from levelproof.pipeline.store.paused import prune_paused
 from levelproof.pipeline.store.remote import as_typed
-from levelproof.pipeline.store.runs import ascending, merged, runs
+from levelproof.pipeline.store.runs import ascending, inside, merged, runs
 from levelproof.pipeline.store.split import writing
 from levelproof.pipeline.words import many
 
@@ -78,6 +78,8 @@ def generate(
             tally = _make(job, split, manifest, wanted, scheduler, command, console, stop)
             manifest = read_manifest(split, ["label", "env_steps"], compact=True)
             _tidy(split, manifest, tell)
+            if isinstance(job, GrowConfig):
+                note_job(split, job, command, merged(_grown(split, manifest, wanted), runs(manifest.level_ids)))
             spent = _spent(manifest, np.setdiff1d(wanted, done), tally.spent) if tally.spent.shown else ""
         else:
             print(f"Nothing to do: the split already has {many(len(wanted), 'level')}.")
@@ -122,6 +124,12 @@ def _tidy(split: Path, manifest: Manifest, tell: Callable[[str], None]) -> None:
     """Delete notes on failures and checkpoints of committed levels."""
     quarantine.drop_notes(split, manifest.level_ids)
     prune_paused(split, manifest.level_ids, tell)
+
+
+def _grown(split: Path, manifest: Manifest, wanted: np.ndarray) -> list[tuple[int, int]]:
+    """Return runs of the wanted levels that are committed or were given up, without those that a Grower left out."""
+    given_up = np.array(merged(*quarantine.given_up(split, manifest.level_ids).values()), np.int64).reshape(-1, 2)
+    return runs(wanted[np.isin(wanted, manifest.level_ids) | inside(wanted, given_up)])
 
 
 def _make(

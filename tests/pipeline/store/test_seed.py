@@ -276,6 +276,7 @@ def test_grow_leaves_out_levels_whose_bits_differ(
     path, out = rewritten(seed, tmp_path / "wrong.parquet", checksum=sums), tmp_path / "128k/s"
     assert grow(path, out, INLINE, Console(stderr=True)) == Exit.FAILED
     assert len(read_manifest(out).level_ids) == table.num_rows - 1
+    assert not examine(out).wrong, "levels that were left out are not missing"
     told = " ".join(capsys.readouterr().err.split())
     assert "Left out: 1 level," in told
     assert f"(level {table['level_id'][wrong]})" in told
