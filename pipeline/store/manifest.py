@@ -31,7 +31,7 @@ from levelproof.pipeline.store.formats import CONFIG_KEY, DENSITIES_KEY, DIGESTS
 from levelproof.pipeline.store.fragment import FULL, Fragment, read_fragment
 from levelproof.pipeline.store.layout import FRAGMENT, JOB, MANIFEST, Attempt, entries, ids_of
 from levelproof.pipeline.store.progress_bar import ProgressBar
-from levelproof.pipeline.store.remote import INDEX, is_remote
+from levelproof.pipeline.store.remote import INDEX, as_typed, is_listed, is_remote
 from levelproof.pipeline.store.runs import ascending
 from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.store.seed.rows import seed_parts
@@ -268,6 +268,12 @@ def _parts(
             if listing and all(part and not part[0].sealed for part in parts):
                 latest = {path: part for (path, _), part in parts_read.items()}  # a path's file may have been replaced
                 return [latest[path] for path in sorted(latest) if latest[path][0].rows]  # fences have no rows
+    missing = [path.name for (path, _), part in zip(new, parts, strict=True) if not part]
+    if missing and not is_listed(split):
+        raise Failure(
+            f"The index {as_typed(split / MANIFEST / INDEX)} names {missing[0]}, which is not there: run `levelproof "
+            "seal` on the split's folder, and upload it again."
+        )
     raise Failure(f"The fragments of {split} change faster than they can be read: try again after the writer ends.")
 
 

@@ -35,6 +35,7 @@ from levelproof.pipeline.store.job_note import NoteError, note_job, read_note
 from levelproof.pipeline.store.layout import FRAGMENT, MANIFEST, WRITER_LOCK, entries
 from levelproof.pipeline.store.leases import is_leased
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, require_manifest, write_index
+from levelproof.pipeline.store.split import taken
 from tests.pace import patience, wait_until
 from tests.pipeline.command import ROOT, assert_refused, line_of
 from tests.pipeline.command import here as command
@@ -469,6 +470,23 @@ def test_revision_of_the_hub_with_a_slash_is_quoted_once(
     with serving(hub_of(tmp_path / "repository", "user/name", "secret", 2, "refs%2Fpr%2F1")) as server:
         monkeypatch.setenv("HF_ENDPOINT", server.url)
         require_same(Path("hf://datasets/user/name@refs%2Fpr%2F1/1M/s"), split)
+
+
+def test_stale_index_on_a_web_server_is_not_read(split: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(split, tmp_path / "s"))
+    write_index(folder)
+    index = folder / MANIFEST / "index.txt"
+    old = index.read_bytes()
+    with taken(folder, print):  # as a command that makes more levels, or seals
+        assert not index.exists()
+    index.write_bytes(old)  # left on the server
+    gone = fragment_paths(folder)[0]
+    gone.unlink()
+    with serving(files_of(tmp_path)) as server:
+        there = f"{server.url}/s"
+        words = f"index {there}/manifest/index.txt names {gone.name}, which is not there: run `levelproof seal` on"
+        with pytest.raises(Failure, match=words):
+            read_manifest(Path(there))
 
 
 def test_split_on_the_hub_reads_as_its_folder(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
