@@ -181,8 +181,7 @@ def is_leased(split: Path, say: Callable[[str], None]) -> bool:
             data = get(split / WRITER_LOCK, MAX_BYTES).data
         except OSError:  # missing, or too large for a lock file
             return False
-        holder = _parsed(data)
-        if RENEWALS not in holder or _died_here(holder):
+        if not _holder(data):
             return False
         if not first:
             first, begun = data, time.monotonic()
@@ -202,7 +201,7 @@ def _taken(path: Path, text: bytes, say: Callable[[str], None]) -> Version:
     while True:
         try:
             lock = get(path)
-            holder, version = _parsed(lock.data), lock.version
+            holder, version = _holder(lock.data), lock.version
         except FileNotFoundError:
             holder, version = {}, None
         writer, now = str(holder.get("writer", "")), time.monotonic()
@@ -213,7 +212,7 @@ def _taken(path: Path, text: bytes, say: Callable[[str], None]) -> Version:
                 )
             since = now
         before = writer, version
-        if not writer or now - since > SILENCE or _died_here(holder):
+        if not writer or now - since > SILENCE:
             if lock_version := put_if(path, text, version):
                 return lock_version
         elif now - begun > NOTICE:
@@ -257,6 +256,15 @@ def _parsed(data: bytes) -> dict[str, Any]:
     except (ValueError, RecursionError):
         content = None
     return content if isinstance(content, dict) else {"writer": "unknown"}
+
+
+def _holder(data: bytes) -> dict[str, Any]:
+    """Parse a lease; return nothing if no writer can hold it: it was released, or its process has ended here.
+
+    A lock that was copied from a folder is no lease.
+    """
+    holder = _parsed(data)
+    return {} if RENEWALS not in holder or _died_here(holder) else holder
 
 
 def _here() -> str:

@@ -508,15 +508,20 @@ def left_by_a_killed_writer(**other: Any) -> bytes:
     return json.dumps(text | {"pid": ended_process.pid} | other).encode()
 
 
-def test_lease_of_a_dead_process_is_taken_at_once_on_its_machine_only(
+def test_lock_that_no_process_holds_is_taken_at_once_a_dead_ones_on_its_machine_only(
     server: Server, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Another machine with the same host name waits, although PID namespaces outside of containers are equal, too."""
     monkeypatch.setattr(leases, "NOTICE", 0.0)
     messages: list[str] = []
-    put(THERE / WRITER_LOCK, left_by_a_killed_writer())
-    Lease(THERE, messages.append).release()
-    assert not messages
+    for lock in (
+        left_by_a_killed_writer(),
+        b'{"writer": "a folder\'s, copied here", "host": "another", "pid": 1}',
+        b"[",
+    ):
+        put(THERE / WRITER_LOCK, lock)
+        Lease(THERE, messages.append).release()
+        assert not messages
     monkeypatch.setattr(leases, "SILENCE", patience(0.3))
     for boot_id in ("a55af8d1-3d1c-4b2c-8a5e-5f0c2a9b0001", None):  # of the other machine; None: unknown
         put(THERE / WRITER_LOCK, left_by_a_killed_writer())
