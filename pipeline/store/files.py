@@ -59,11 +59,12 @@ def replacing(path: Path) -> Iterator[Path]:
         raise
 
 
-def remove(path: Path) -> None:
-    """Remove a file, if it exists. Raises as `write`."""
-    if is_remote(path):
-        objects.remove([path])
-    else:
+def remove(*paths: Path) -> None:
+    """Remove files of one split, if they exist; in a store by one request. Raises as `write`."""
+    if paths and is_remote(paths[0]):
+        objects.remove(paths)
+        return
+    for path in paths:
         path.unlink(missing_ok=True)
 
 

@@ -136,19 +136,20 @@ def seal(
     replaced = _replaced(split, shards, paths)
     digests = {name: files for fragment, _ in parts for name, files in fragment.digests.items()}
     _require_committed(shards, digests)
-    places, between = _places(table, shards, moved), list[Path]()
+    places, between, disowned = _places(table, shards, moved), list[Path](), list[Path]()
     old_densities = frozenset().union(*(fragment.densities for fragment, _ in parts))
     densities = frozenset([stored_as(*density)]) if density else old_densities
     first, last = (int(table.column("level_id")[i].as_py()) for i in (0, -1))
     unit, count = unit_name(first, last), 1 if density else len(places)
     making = publishing(split, paths) if is_remote(split) else nullcontext(split)  # where new data is written
-    with making as folder, _attempted(folder, unit, max(count, 1), replaced, between) as attempts:
+    with making as folder, _attempted(folder, unit, max(count, 1), disowned, between) as attempts:
         if density:
             places = _converted(places, density, lambda: _another(folder, unit, between), converted)
         merged = dict(zip((attempt.shard for attempt in attempts), places.values(), strict=False))
         for shard, sources in merged.items():
             merge_shards(shard, sources, moved, rows_a_file)
         require_served(split)
+        disowned += replaced
         disown(replaced)
         write_fragment(attempts[0], _moved(table, merged), about.config_hash, about.config, True, densities, digests)
     sealed = fragment_path(split, unit)
@@ -216,12 +217,12 @@ def _places(table: pa.Table, shards: Mapping[str, Path], moved: Callable[[int], 
 
 @contextmanager
 def _attempted(
-    split: Path, unit: str, count: int, replaced: Sequence[Path], between: Sequence[Path]
+    split: Path, unit: str, count: int, disowned: Sequence[Path], between: Sequence[Path]
 ) -> Iterator[list[Attempt]]:
     """Yield `count` attempts at a sealed unit, one per shard; the first one's fragment commits.
 
-    An exception in the block leaves the split as it was. Intermediate shards `between` are removed at the end of the
-    block, the `replaced` ones after the commit.
+    An exception in the block leaves the split as it was, without the marks of the shards that the block has `disowned`.
+    Intermediate shards `between` are removed at the end of the block.
     """
     attempts = [new_attempt(split, unit) for _ in range(count)]
     try:
@@ -232,8 +233,7 @@ def _attempted(
         if attempts[0].begun.exists():  # not committed
             for attempt in attempts:
                 drop(attempt.shard)
-            for mark in map(begun_path, replaced):  # `drop` removed those of the new shards, unless a shard stays
-                remove(mark)
+            remove(*map(begun_path, disowned))  # `drop` removed those of the new shards, unless a shard stays
         raise
     finally:
         for shard in between:

@@ -26,6 +26,7 @@ from levelproof.pipeline.jobs import unit
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import failure
 from levelproof.pipeline.store import leases, leftovers, machine, publish, remote, requests
+from levelproof.pipeline.store import seal as sealing
 from levelproof.pipeline.store.checksums import has_own
 from levelproof.pipeline.store.event_files import KEPT, events_of, new_run, runs_in, write_events
 from levelproof.pipeline.store.layout import (
@@ -331,6 +332,25 @@ def test_commit_keeps_its_data_if_the_answer_is_lost_and_another_writer_takes_ov
     manifest = require_same_content(THERE, here)
     assert {path.relative_to(THERE).as_posix() for path in data_paths(THERE)} == manifest.shards
     assert not [path for path in remote.stored_in(THERE) if path.suffix == ".begun"]
+
+
+@pytest.mark.parametrize(("step", "requests_after"), [("merge_shards", 0), ("write_fragment", 1)])
+def test_interrupted_seal_removes_only_the_marks_that_it_made_and_at_once(
+    server: Server, monkeypatch: pytest.MonkeyPatch, step: str, requests_after: int
+) -> None:
+    drive(OUT)
+    pieces, before = list(map(Piece.of, read_manifest(THERE).fragments)), remote.stored_in(THERE)
+    counts = list[int]()
+
+    def interrupt(*_: Any) -> None:
+        counts.append(server.count)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sealing, step, interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        seal(THERE, pieces)
+    assert server.count - counts[0] == requests_after
+    assert remote.stored_in(THERE) == before
 
 
 @pytest.mark.campaign
