@@ -9,7 +9,7 @@ from levelproof.pipeline.store.checksums import has_own
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.progress_bar import ProgressBar
 from levelproof.pipeline.store.seed.columns import ROW_GROUP
-from levelproof.pipeline.store.seed.file import STORED, read_seed, seed_files
+from levelproof.pipeline.store.seed.file import STORED, missing_seed, read_seed, seed_files
 from levelproof.pipeline.store.seed.shard import SeedShard
 from levelproof.pipeline.store.seed.source import LevelSource
 from levelproof.pipeline.store.seed.write import content_digest
@@ -23,10 +23,13 @@ def examine_seeds(source: Path, console: Console | None) -> Findings:
     """Check the seed files at a path; show progress on `console`.
 
     Raises:
-        Failure: this program makes other levels from their ids, or they mix several configurations.
+        Failure: there is none, this program makes other levels from their ids, or they mix several configurations.
     """
     findings, files = Findings(stored=STORED), seed_files(source)
-    whole = [path for path in files if has_own(path)]
+    try:
+        whole = [path for path in files if has_own(path)]
+    except FileNotFoundError:
+        raise missing_seed(source) from None
     for path in sorted({*files} - {*whole}):
         findings.add(f"The seed file {path} is not what was written: its bytes have changed.", [])
     if len(whole) == len(files):

@@ -123,7 +123,7 @@ def _opened(path: Path) -> Iterator[tuple[SeedFile, Bounded, dict[str, str]]]:
             fragment = Fragment(path, config_hash, config, {}, file.rows, True, frozenset({STORED}))
             yield SeedFile(fragment, budget, tuple(content)), file, VERSIONS[version]
     except FileNotFoundError:
-        raise Failure(f"There is no seed file {path}: `levelproof export SPLIT --format seed` writes one.") from None
+        raise missing_seed(path) from None
     except PermissionError:
         raise Failure(f"The seed file {path} cannot be read: check its permissions.") from None
     except OtherKind:
@@ -131,6 +131,11 @@ def _opened(path: Path) -> Iterator[tuple[SeedFile, Bounded, dict[str, str]]]:
         raise UserError(f"The file {path} is parquet, but not a seed file: {whole}.") from None
     except DAMAGE as error:
         raise damaged_seed(path, error) from error
+
+
+def missing_seed(path: Path) -> Failure:
+    """Return the Failure for a seed file that does not exist."""
+    return Failure(f"There is no seed file {path}: `levelproof export SPLIT --format seed` writes one.")
 
 
 def damaged_seed(path: Path, error: Exception) -> Failure:

@@ -214,6 +214,8 @@ def test_seed_file_by_url_is_inspected_read_and_verified(seed: Path, tmp_path: P
         assert [facts.pop("split") for facts in inspected] == [url, str(seed)]
         shown = [{name: value for name, value in facts.items() if "bytes" not in name} for facts in inspected]
         assert shown[0] == shown[1]
+        for command in ("verify", "inspect"):
+            assert_refused(here([command, f"{url}.x.parquet"], tmp_path), 1, f"There is no seed file {url}.x.parquet:")
         done = here(["verify", url], tmp_path)
         assert (done.returncode, " 0 problems." in done.stdout) == (0, True), done.stderr
         facts = json.loads(here(["diff", url, str(seed), "--json"], tmp_path).stdout)
