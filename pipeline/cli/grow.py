@@ -9,7 +9,7 @@ SUMMARY = "make a split from seed files, with every witness replayed and checked
 EXAMPLE = """\
 levelproof grow levels.parquet -o grown/256k/s
 levelproof grow seeds/256k/s -o grown/256k/s density=witness executor=inline"""
-SEEDS = "a seed file that `export --format seed` wrote, or a folder of them; path or URL"
+SEEDS = "a seed file that `export --format seed` wrote (path or URL), or a folder of them"
 OUT = "the split to make or continue: FOLDER/BUDGET/SIZE, with the seeds' budget and size"
 SETTINGS = "density=, key_every=, executor= or workers=, as for generate"
 
