@@ -28,7 +28,9 @@ Event = Mapping[str, Any]  # `time` in s since 1970, `event`, and the event's da
 
 
 def new_run(split: Path) -> Path:
-    """Return the path for the events of a run that begins now, and delete the oldest runs; names sort by time.
+    """Return the path for the events of a run that begins now, and delete the oldest runs.
+
+    Names sort by time; if the clock went back, or is behind that of another machine, the new name still comes last.
 
     Raises:
         OSError: the write fails.
@@ -36,9 +38,17 @@ def new_run(split: Path) -> Path:
     """
     if not is_remote(split):
         (split / EVENTS).mkdir(exist_ok=True)
-    for path in [*runs_in(split)[: 1 - KEPT], *entries(split, EVENTS, HALF, DirEntry.is_file)]:
+    runs = runs_in(split)
+    for path in [*runs[: 1 - KEPT], *entries(split, EVENTS, HALF, DirEntry.is_file)]:
         remove(path)
-    return split / EVENTS / f"{datetime.now(UTC):%Y%m%dT%H%M%S%f}-{secrets.token_hex(4)}.jsonl"
+    now = int(f"{datetime.now(UTC):%Y%m%d%H%M%S%f}")
+    digits = f"{max([now, *(_number(path) + 1 for path in runs)]):020d}"
+    return split / EVENTS / f"{digits[:8]}T{digits[8:]}-{secrets.token_hex(4)}.jsonl"
+
+
+def _number(run: Path) -> int:
+    """Return the digits of a run's time as a number; those after it need not be a time."""
+    return int(run.name.partition("-")[0].replace("T", ""))
 
 
 def runs_in(split: Path) -> list[Path]:

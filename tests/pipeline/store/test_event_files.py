@@ -30,6 +30,17 @@ def test_write_events_replaces_a_runs_file_and_new_run_removes_old_ones(tmp_path
     }
 
 
+def test_new_run_comes_last_although_the_clock_went_back(tmp_path: Path) -> None:
+    """Watchers take the last one for the current run."""
+    (tmp_path / EVENTS).mkdir()
+    for stamp in ("20260101T000000000000", "20991231T235959999999"):
+        (tmp_path / EVENTS / f"{stamp}-ffffffff.jsonl").touch()
+    for _ in range(3):
+        path = new_run(tmp_path)
+        write_events(path, [])
+        assert runs_in(tmp_path)[-1] == path
+
+
 def test_write_events_ignores_failed_writes(tmp_path: Path) -> None:
     write_events(tmp_path / "gone" / "run.jsonl", [{"time": 1.0, "event": "started"}])
 
