@@ -12,6 +12,8 @@ from levelproof.pipeline.store.runs import runs, runs_text
 from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.words import many
 
+COUNTS = ("levels", "shards", "witnesses", "same_bits")
+
 
 @dataclass
 class Findings:
@@ -26,7 +28,7 @@ class Findings:
         default_factory=list
     )  # runs of levels that the last command requested, and no fragment has
     # For repairs
-    examined: set[tuple[Path, int]] = field(default_factory=set)  # fragments at the start (`layout.fragment_files`)
+    examined: set[tuple[Path, int]] = field(default_factory=set)  # fragments, as in `layout.fragment_files`
     present: list[tuple[int, int]] = field(default_factory=list)  # runs of levels in sound fragments
     fragments: dict[Path, str] = field(default_factory=dict)  # damaged fragments, and why
     changed: set[str] = field(default_factory=set)  # shards and experts that differ from what was committed
@@ -42,6 +44,20 @@ class Findings:
         """Add a sentence on what is wrong, and the levels that must be remade."""
         self.wrong.setdefault(sentence, set()).update(level_ids)
         self.lost.update(self.wrong[sentence])
+
+    def include(self, other: "Findings") -> None:
+        """Add the findings about a part of the split."""
+        for name in COUNTS:
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        for sentence, level_ids in other.wrong.items():
+            self.wrong.setdefault(sentence, set()).update(level_ids)
+        self.fragments |= other.fragments
+        self.changed |= other.changed
+        self.lost |= other.lost
+        self.origins |= other.origins
+        self.unrepairable |= other.unrepairable
+        self.budget, self.stored = other.budget or self.budget, other.stored or self.stored
+        self.config = other.config or self.config
 
     @property
     def sentences(self) -> list[str]:
@@ -62,7 +78,7 @@ class Findings:
 
     def as_json(self) -> dict[str, Any]:
         """Return the findings for `verify --json`."""
-        counts = {name: getattr(self, name) for name in ("levels", "shards", "witnesses", "same_bits")}
+        counts = {name: getattr(self, name) for name in COUNTS}
         wrong = [{"what": sentence, "levels": runs(sorted(ids))} for sentence, ids in self.wrong.items()]
         return counts | {"wrong": wrong, "missing": self.missing}
 

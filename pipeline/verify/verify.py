@@ -10,6 +10,7 @@ import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from itertools import islice
 from os import DirEntry
 from pathlib import Path
@@ -66,9 +67,19 @@ from levelproof.pipeline.verify.findings import Findings, why_not_repaired
 from levelproof.pipeline.verify.seeds import examine_seeds
 
 GROUP_ROWS = 4 * CHUNK  # minimum number of rows per group of fragments
-ATTEMPTS = 3  # maximum number of examinations, if fragments are sealed concurrently
+ROUNDS = 20  # maximum number of examinations, if fragments are sealed concurrently; each examines only new ones
 
 Part = tuple[Fragment, pa.Table]  # a fragment and its rows
+
+
+@dataclass
+class Group:
+    """Fragments that are examined together."""
+
+    files: list[tuple[Path, int]] = field(default_factory=list)  # as in `layout.fragment_files`
+    ids: list[np.ndarray] = field(default_factory=list)  # of the levels of sound fragments
+    named: set[str] = field(default_factory=set)  # shards and experts that sound fragments name
+    findings: Findings = field(default_factory=Findings)
 
 
 def verify(split: Path, as_json: bool, console: Console) -> Exit:
@@ -99,31 +110,54 @@ def examine(
     prepare_jax(device=device, threads=threads)
     if is_seed(split):
         return examine_seeds(split, console)
-    findings = _examine_once(split, console)
-    for _ in range(ATTEMPTS - 1):
+    groups: list[Group] = []
+    for _ in range(ROUNDS):
+        groups = _examined(split, groups, console)
+        findings = _summed(split, groups, console)
         if not findings.wrong or fragment_files(split) == findings.examined:
-            break
-        findings = _examine_once(split, console)
-    return findings
+            return findings
+    there = fragment_files(split)
+    return _summed(split, [group for group in groups if there.issuperset(group.files)], console)
 
 
-def _examine_once(split: Path, console: Console | None) -> Findings:
-    findings = Findings(examined=fragment_files(split))
-    note, paths = _note(split, findings), fragment_paths(split)
+def _examined(split: Path, before: Sequence[Group], console: Console | None) -> list[Group]:
+    """Examine the fragments that no group of `before` has; return the groups whose fragments are all still there.
+
+    A seal, or another command, replaces fragments, and then removes what they alone name. So what is missing in a group
+    of fragments that are still there was missing before.
+    """
+    there = fragment_files(split)
+    groups = [group for group in before if there.issuperset(group.files)]
+    new = sorted(there.difference(*(group.files for group in groups)))
     recipe: Recipe | None = None
-    named: set[str] = set()  # shards and experts that sound fragments name
-    ids = [np.zeros(0, np.int64)]
-    with ProgressBar("levels", sum(map(_rows_in, paths)), console) as progress:
-        for parts in _groups(paths, findings):
-            recipe = recipe or _recipe(split, parts[0][0], findings)
+    config = next((group.findings.config for group in groups if group.findings.config), None)
+    with ProgressBar("levels", sum(_rows_in(path) for path, _ in new), console) as progress:
+        for group, parts in _groups(new):
+            groups.append(group)
+            if not parts:
+                continue
+            findings, first = group.findings, parts[0][0]
+            recipe = recipe or _recipe(split, first)
+            findings.config = config = config or first.config
             findings.budget = parts[0][1].column("budget")[0].as_py()
-            findings.stored = min(parts[0][0].densities, default="")
-            _require_one_configuration(split, parts, findings.config or {})
+            findings.stored = min(first.densities, default="")
+            _require_one_configuration(split, parts, config)
             _check_fragments(parts, recipe, findings, progress)
-            ids += [rows.column("level_id").to_numpy() for _, rows in parts]
-            named |= {name for fragment, _ in parts for name in fragment.digests}
+            group.ids.append(np.concatenate([rows.column("level_id").to_numpy() for _, rows in parts]))
+            group.named.update(name for fragment, _ in parts for name in fragment.digests)
+    return groups
+
+
+def _summed(split: Path, groups: Sequence[Group], console: Console | None) -> Findings:
+    """Join the findings of groups, and add what only the whole split shows."""
+    findings = Findings()
+    note = _note(split, findings)
+    for group in groups:
+        findings.include(group.findings)
+        findings.examined.update(group.files)
+    named = set[str]().union(*(group.named for group in groups))
     findings.names_experts = any(name.startswith(f"{EXPERTS}/") for name in named)
-    present = np.unique(np.concatenate(ids))
+    present = np.unique(np.concatenate([np.zeros(0, np.int64), *(ids for group in groups for ids in group.ids)]))
     findings.present = runs(present)
     say = lambda text: console and console.print(text, highlight=False, markup=False, soft_wrap=True)
     running = is_written(split, say)
@@ -155,24 +189,25 @@ def _rows_in(path: Path) -> int:
     return 0
 
 
-def _groups(paths: Sequence[Path], findings: Findings) -> Iterator[list[Part]]:
-    """Yield fragments and their rows in groups of about GROUP_ROWS rows; note damaged ones in `findings`.
+def _groups(files: Sequence[tuple[Path, int]]) -> Iterator[tuple[Group, list[Part]]]:
+    """Yield fragments in groups of about GROUP_ROWS rows, damaged ones with their reasons, and the sound ones' rows.
 
     Raises:
         DataUnread: a fragment cannot be read, so that nothing is known about it.
     """
-    group: list[Part] = []
-    for path in paths:
+    group, parts = Group(), list[Part]()
+    for file in files:
+        group.files.append(file)
         try:
-            part = _part(path)
-            group += [part] if part[0].rows else []  # empty ones are fences
+            part = _part(file[0])
+            parts += [part] if part[0].rows else []  # empty ones are fences
         except DataUnread:
             raise
         except Failure as failure:
-            findings.fragments[path] = str(failure)
-        if sum(rows.num_rows for _, rows in group) >= GROUP_ROWS or (group and path == paths[-1]):
-            yield group
-            group = []
+            group.findings.fragments[file[0]] = str(failure)
+        if sum(rows.num_rows for _, rows in parts) >= GROUP_ROWS or file == files[-1]:
+            yield group, parts
+            group, parts = Group(), []
 
 
 def _part(path: Path) -> Part:
@@ -193,9 +228,9 @@ def _part(path: Path) -> Part:
     return fragment, rows
 
 
-def _recipe(split: Path, fragment: Fragment, findings: Findings) -> Recipe:
+def _recipe(split: Path, fragment: Fragment) -> Recipe:
     """Return how to make and play the levels. Raise Failure if this version cannot."""
-    findings.config = config = fragment.config
+    config = fragment.config
     with recorded_settings(split):
         if config["sampler_version"] not in ALIKE_VERSIONS:  # levels of alike versions are compared by signature
             raise ConfigError(f"sampler version {config['sampler_version']}, but this levelproof has {SAMPLER_VERSION}")

@@ -3,7 +3,7 @@
 import errno
 import itertools
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,10 @@ from levelproof.pipeline.store import fragment, remote, requests
 from levelproof.pipeline.store import shard as shards
 from levelproof.pipeline.store.formats import VERSION_KEY
 from levelproof.pipeline.store.job_note import note_job
-from levelproof.pipeline.store.layout import JOB, MANIFEST, unit_name
+from levelproof.pipeline.store.layout import JOB, MANIFEST, fragment_files, unit_name
 from levelproof.pipeline.store.locks import only_writer
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, write_index
+from levelproof.pipeline.store.seal import Piece, seal
 from levelproof.pipeline.store.shard import Shard, write_shard
 from levelproof.pipeline.verify import evidence
 from levelproof.pipeline.verify import verify as verifying
@@ -117,6 +118,28 @@ def test_examine_reports_a_failing_server_as_such_and_not_as_damage(
             with pytest.raises(StoreFailure, match="503"):
                 examine(Path(f"{server.url}/{split.name}"))
             server.spoil(0)
+
+
+def test_examine_finds_nothing_wrong_in_a_split_that_is_sealed_meanwhile(
+    split: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At each look, a run merges two fragments after they were listed and before they are read."""
+    groups, sealed = verifying._groups, list[Path]()
+
+    def merging(*listed: Any) -> Iterator[Any]:
+        pieces = list(map(Piece.of, read_manifest(split, []).fragments))
+        sealed.extend([seal(split, pieces[:2]).path] if pieces[1:] else [])
+        return groups(*listed)
+
+    levels = read_manifest(split, []).level_ids.tolist()
+    monkeypatch.setattr(verifying, "GROUP_ROWS", 1)
+    monkeypatch.setattr(verifying, "_groups", merging)
+    with only_writer(split, print):
+        findings = examine(split)
+    assert findings.sentences == []
+    assert findings.levels == len(levels)
+    assert len(sealed) == UNITS - 1 > 2
+    assert findings.examined == fragment_files(split)
 
 
 @pytest.mark.parametrize("adapts", [False, True])
