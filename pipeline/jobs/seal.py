@@ -20,7 +20,7 @@ from levelproof.pipeline.store.bounds import MAX_ROWS
 from levelproof.pipeline.store.disk import explaining_writes
 from levelproof.pipeline.store.job_note import note_density
 from levelproof.pipeline.store.layout import fragment_path, unit_name
-from levelproof.pipeline.store.manifest import Fragment, require_manifest, write_index
+from levelproof.pipeline.store.manifest import Fragment, require_manifest
 from levelproof.pipeline.store.progress_bar import ProgressBar
 from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.scratch import written_disk
@@ -55,7 +55,7 @@ def seal_split(
     if density:
         prepare_jax()
     wanted = (density, key_every) if density else None
-    with taken(split, partial(say, console)) as manifest:
+    with taken(split, partial(say, console), indexed=True) as manifest:
         pieces = list(map(Piece.of, manifest.counting))
         groups = store.plan(pieces, rows or store.ROWS)
         if wanted:
@@ -68,7 +68,6 @@ def seal_split(
                 end += sum(piece.rows for piece in group)
                 seal(split, group, density=wanted, converted=bar.advance)
                 bar.advance(end - bar.completed)  # those that had nothing to convert
-            write_index(split)
             if density:
                 note_density(split, density, key_every)
     merged = sum(map(len, groups))

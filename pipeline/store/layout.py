@@ -29,6 +29,7 @@ CHECKPOINT_BEGUN = re.compile(rf"{CHECKPOINTS}/\.{UNIT}\.(paused|npz)\.[0-9]+")
 NOTE = re.compile(rf"{QUARANTINE}/{UNIT}\.txt")  # why a unit was given up
 NOTE_BEGUN = re.compile(rf"{QUARANTINE}/\.{UNIT}\.txt\.[0-9]+")
 JOB_BEGUN = re.compile(rf"\.{re.escape(JOB)}\.[0-9]+")  # ends in the PID of its writer
+INDEX_FILE = re.compile(rf"{MANIFEST}/{re.escape(INDEX)}")
 INDEX_BEGUN = re.compile(rf"{MANIFEST}/\.{re.escape(INDEX)}\.[0-9]+")
 
 

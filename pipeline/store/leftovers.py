@@ -24,11 +24,11 @@ from levelproof.pipeline.store.locks import without_commits
 from levelproof.pipeline.store.manifest import DATA_COLUMNS, Manifest, data_named_by, read_fragment, read_manifest
 from levelproof.pipeline.store.objects import put
 from levelproof.pipeline.store.publish import OVER, ended
-from levelproof.pipeline.store.remote import INDEX, as_typed, is_remote
+from levelproof.pipeline.store.remote import as_typed, is_remote
 
 
 def clean(split: Path, say: Callable[[str], None]) -> Manifest:
-    """Remove data of uncommitted attempts, half-written files, and what a sealed fragment supersedes; also the index.
+    """Remove data of uncommitted attempts, half-written files, and what a sealed fragment supersedes; nothing else.
 
     Excludes commits, because a worker of a killed run may be about to commit its shard. Unnamed data without an
     attempt's mark stays and is reported through `say`: its fragment may be kept elsewhere.
@@ -42,7 +42,6 @@ def clean(split: Path, say: Callable[[str], None]) -> Manifest:
         begun = entries(split, MANIFEST, BEGUN, DirEntry.is_file)
         manifest = read_manifest(split, ["label", *DATA_COLUMNS], compact=True)
         named = manifest.shards | manifest.named["experts"]
-        remove(split / MANIFEST / INDEX)  # it would not name what this command commits
         for fragment in manifest.superseded:
             theirs = data_named_by(read_fragment(fragment.path, DATA_COLUMNS)[1])
             disown(data_path(split, name) for name in theirs - named)

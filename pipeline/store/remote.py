@@ -143,6 +143,11 @@ def fragments_in(folder: Path) -> dict[Path, Stored]:
             f"There is no split at {as_typed(folder.parent)}, or it has no index: a split on a web "
             f"server needs {folder.name}/{INDEX}, which `levelproof seal` writes."
         ) from None
+    if not text:
+        raise UserError(
+            f"A command writes to the split at {as_typed(folder.parent)}, or was stopped before it was uploaded: run "
+            "`levelproof seal` on its folder, and upload it again."
+        )
     return {folder / name: Stored("", 0) for name in text.decode(errors="replace").split() if "/" not in name}
 
 

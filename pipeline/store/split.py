@@ -4,15 +4,17 @@ import os
 import secrets
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from os import DirEntry
 from pathlib import Path
 
 from levelproof.configs.schema import REMOVED, JobConfig
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.store.disk import explaining_writes, flush_entry, write_new
-from levelproof.pipeline.store.layout import EVENTS, FOLDERS, JOB, split_path
+from levelproof.pipeline.store.files import write
+from levelproof.pipeline.store.layout import EVENTS, FOLDERS, INDEX_FILE, JOB, MANIFEST, entries, split_path
 from levelproof.pipeline.store.leftovers import clean
 from levelproof.pipeline.store.locks import committing, only_writer
-from levelproof.pipeline.store.manifest import Manifest, changes_text, differences
+from levelproof.pipeline.store.manifest import Manifest, changes_text, differences, write_index
 from levelproof.pipeline.store.objects import require_conditions
 from levelproof.pipeline.store.remote import is_remote
 from levelproof.pipeline.store.scratch import written_disk
@@ -53,15 +55,22 @@ def writing(job: JobConfig, say: Callable[[str], None], split: Path | None = Non
 
 
 @contextmanager
-def taken(split: Path, say: Callable[[str], None]) -> Iterator[Manifest]:
-    """Lock and clean a split; yield its manifest.
+def taken(split: Path, say: Callable[[str], None], indexed: bool = False) -> Iterator[Manifest]:
+    """Lock and clean a split; yield its manifest. At the end write its index, if `indexed` or if it had one.
+
+    Until then, or until the next command ends if this one does not end well, the index is empty.
 
     Raises:
         UserError: it cannot be written or locked, or is being written.
         Failure: a fragment is damaged.
     """
     with locked(split, say):
+        indices = entries(split, MANIFEST, INDEX_FILE, DirEntry.is_file)
+        for index in indices:
+            write(index, b"")
         yield clean(split, say)
+        if indexed or indices:
+            write_index(split)
 
 
 @contextmanager

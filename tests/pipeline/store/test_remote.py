@@ -474,19 +474,26 @@ def test_revision_of_the_hub_with_a_slash_is_quoted_once(
 
 def test_stale_index_on_a_web_server_is_not_read(split: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(split, tmp_path / "s"))
+    index, gone = folder / MANIFEST / "index.txt", fragment_paths(folder)[0]
+    with taken(folder, print):
+        pass
+    assert not index.exists(), "it had none before"
     write_index(folder)
-    index = folder / MANIFEST / "index.txt"
     old = index.read_bytes()
-    with taken(folder, print):  # as a command that makes more levels, or seals
-        assert not index.exists()
-    index.write_bytes(old)  # left on the server
-    gone = fragment_paths(folder)[0]
     gone.unlink()
     with serving(files_of(tmp_path)) as server:
-        there = f"{server.url}/s"
-        words = f"index {there}/manifest/index.txt names {gone.name}, which is not there: run `levelproof seal` on"
+        there = Path(f"{server.url}/s")
+        with pytest.raises(KeyboardInterrupt), taken(folder, print):  # as a command that makes more levels, or seals
+            raise KeyboardInterrupt
+        with pytest.raises(UserError, match=f"writes to the split at {server.url}/s, or was stopped before it was upl"):
+            read_manifest(there)
+        index.write_bytes(old)
+        words = f"index {server.url}/s/manifest/index.txt names {gone.name}, which is not there: run `levelproof seal`"
         with pytest.raises(Failure, match=words):
-            read_manifest(Path(there))
+            read_manifest(there)
+        with taken(folder, print):
+            pass
+        assert read_manifest(there, []).level_ids.tolist() == read_manifest(folder, []).level_ids.tolist()
 
 
 def test_split_on_the_hub_reads_as_its_folder(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
