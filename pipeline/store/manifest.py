@@ -255,6 +255,7 @@ def _parts(
     lists the folder again until a listing finds no new sealed fragment, and no listed one that is missing when read.
     """
     parts_read: dict[tuple[Path, int], tuple[Fragment, pa.Table]] = {}
+    missing: list[str] = []
     with ThreadPoolExecutor(THREADS) as threads:
         for listing in range(MAX_LISTINGS):
             listed = entries(split, MANIFEST, FRAGMENT, DirEntry.is_file).items()
@@ -264,11 +265,11 @@ def _parts(
                 for part in threads.map(read, (path for path, _ in new)):
                     parts.append(part)
                     bar.advance(1)
+            missing = [path.name for (path, _), part in zip(new, parts, strict=True) if not part]
             parts_read |= {entry: part for entry, part in zip(new, parts, strict=True) if part}
             if listing and all(part and not part[0].sealed for part in parts):
                 latest = {path: part for (path, _), part in parts_read.items()}  # a path's file may have been replaced
                 return [latest[path] for path in sorted(latest) if latest[path][0].rows]  # fences have no rows
-    missing = [path.name for (path, _), part in zip(new, parts, strict=True) if not part]
     if missing and not is_listed(split):
         raise Failure(
             f"The index {as_typed(split / MANIFEST / INDEX)} names {missing[0]}, which is not there: run `levelproof "

@@ -73,7 +73,7 @@ Part = tuple[Fragment, pa.Table]  # a fragment and its rows
 
 
 @dataclass
-class Group:
+class FragmentGroup:
     """Fragments that are examined together."""
 
     files: list[tuple[Path, int]] = field(default_factory=list)  # as in `layout.fragment_files`
@@ -110,7 +110,7 @@ def examine(
     prepare_jax(device=device, threads=threads)
     if is_seed(split):
         return examine_seeds(split, console)
-    groups: list[Group] = []
+    groups: list[FragmentGroup] = []
     for _ in range(ROUNDS):
         groups = _examined(split, groups, console)
         findings = _summed(split, groups, console)
@@ -120,7 +120,7 @@ def examine(
     return _summed(split, [group for group in groups if there.issuperset(group.files)], console)
 
 
-def _examined(split: Path, before: Sequence[Group], console: Console | None) -> list[Group]:
+def _examined(split: Path, before: Sequence[FragmentGroup], console: Console | None) -> list[FragmentGroup]:
     """Examine the fragments that no group of `before` has; return the groups whose fragments are all still there.
 
     A seal, or another command, replaces fragments, and then removes what they alone name. So what is missing in a group
@@ -148,7 +148,7 @@ def _examined(split: Path, before: Sequence[Group], console: Console | None) -> 
     return groups
 
 
-def _summed(split: Path, groups: Sequence[Group], console: Console | None) -> Findings:
+def _summed(split: Path, groups: Sequence[FragmentGroup], console: Console | None) -> Findings:
     """Join the findings of groups, and add what only the whole split shows."""
     findings = Findings()
     note = _note(split, findings)
@@ -189,13 +189,13 @@ def _rows_in(path: Path) -> int:
     return 0
 
 
-def _groups(files: Sequence[tuple[Path, int]]) -> Iterator[tuple[Group, list[Part]]]:
+def _groups(files: Sequence[tuple[Path, int]]) -> Iterator[tuple[FragmentGroup, list[Part]]]:
     """Yield fragments in groups of about GROUP_ROWS rows, damaged ones with their reasons, and the sound ones' rows.
 
     Raises:
         DataUnread: a fragment cannot be read, so that nothing is known about it.
     """
-    group, parts = Group(), list[Part]()
+    group, parts = FragmentGroup(), list[Part]()
     for file in files:
         group.files.append(file)
         try:
@@ -207,7 +207,7 @@ def _groups(files: Sequence[tuple[Path, int]]) -> Iterator[tuple[Group, list[Par
             group.findings.fragments[file[0]] = str(failure)
         if sum(rows.num_rows for _, rows in parts) >= GROUP_ROWS or file == files[-1]:
             yield group, parts
-            group, parts = Group(), []
+            group, parts = FragmentGroup(), []
 
 
 def _part(path: Path) -> Part:
