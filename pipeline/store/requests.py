@@ -15,9 +15,9 @@ from levelproof.pipeline.errors import LevelproofError, StoreFailure, UserError
 from levelproof.pipeline.urls import as_typed
 
 REQUESTS = 16  # concurrent
-SENDS = 4  # concurrent requests that send much: a slow link must send all of them before SENDING ends
+SENDS = 4  # concurrent requests that send much; a link of 0.6 Mbit/s sends their parts within SENDING
 RECEIVE_TURN, SEND_TURN = BoundedSemaphore(REQUESTS), BoundedSemaphore(SENDS)  # of this process
-MUCH = 2**20  # bytes of a request that waits for its turn to send
+MUCH = 2**18  # bytes of a request that waits for its turn to send; less is sent by REQUESTS requests within a minute
 STREAMED = 2**20  # bytes of a response that are taken at once
 RETRIES: dict[str, Any] = {
     "max_retries": 8,  # of a request that is throttled, refused, cut off or not answered; with jitter

@@ -25,7 +25,7 @@ from levelproof.pipeline.jobs import seal as jobs_seal
 from levelproof.pipeline.jobs import unit
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import failure
-from levelproof.pipeline.store import leases, leftovers, machine, publish, remote, requests
+from levelproof.pipeline.store import leases, leftovers, machine, objects, publish, remote, requests
 from levelproof.pipeline.store import seal as sealing
 from levelproof.pipeline.store.checksums import has_own
 from levelproof.pipeline.store.event_files import KEPT, events_of, new_run, runs_in, write_events
@@ -146,6 +146,9 @@ def test_large_files_are_sent_a_few_at_a_time_and_may_take_long(
     server: Server, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """The limit of silence of other requests would include the time that it takes to send them."""
+    sent = requests.SENDS * objects.PART, requests.REQUESTS * requests.MUCH
+    limits = requests.SENDING, requests.PATIENCE["read_timeout"]
+    assert all(8 * size / limit.total_seconds() < 0.6e6 for size, limit in zip(sent, limits, strict=True))
     monkeypatch.setitem(requests.PATIENCE, "read_timeout", timedelta(seconds=patience(0.5)))
     forget()
     (tmp_path / "file").write_bytes(bytes(requests.MUCH + 1))
