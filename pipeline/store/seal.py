@@ -124,8 +124,7 @@ def seal(
     Raises:
         Failure: a fragment or a shard is damaged, the engine cannot convert it, or the sealed fragment would be too
             large to be read; nothing has changed.
-        LeaseLost: another writer has the split now; nothing has changed.
-        OSError: the write fails; nothing has changed.
+        LeaseLost, OSError: another writer has the split now, or the write fails; nothing has changed.
     """
     paths = {piece.path for piece in pieces}
     if is_remote(split):
@@ -137,8 +136,7 @@ def seal(
     digests = {name: files for fragment, _ in parts for name, files in fragment.digests.items()}
     _require_committed(shards, digests)
     places, between, disowned = _places(table, shards, moved), list[Path](), list[Path]()
-    old_densities = frozenset().union(*(fragment.densities for fragment, _ in parts))
-    densities = frozenset([stored_as(*density)]) if density else old_densities
+    densities = frozenset([stored_as(*density)]) if density else frozenset().union(*(one.densities for one, _ in parts))
     first, last = (int(table.column("level_id")[i].as_py()) for i in (0, -1))
     unit, count = unit_name(first, last), 1 if density else len(places)
     making = publishing(split, paths) if is_remote(split) else nullcontext(split)  # where new data is written
