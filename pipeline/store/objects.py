@@ -9,12 +9,11 @@ from contextlib import suppress
 from functools import partial
 from math import inf
 from pathlib import Path
-from threading import BoundedSemaphore
 from typing import Any, NamedTuple
 
 from levelproof.pipeline.errors import StoreFailure, UserError
 from levelproof.pipeline.store.remote import place
-from levelproof.pipeline.store.requests import MUCH, SEND_TURN, ask, data_of, obstore_module
+from levelproof.pipeline.store.requests import MUCH, SENDING_MUCH, Turns, ask, data_of, obstore_module
 from levelproof.pipeline.urls import BUCKETS, as_typed
 
 PART = 2**23  # bytes; larger files are sent in parts, one after another
@@ -79,12 +78,12 @@ def put(path: Path, data: bytes | Path) -> None:
     size = data.stat().st_size if isinstance(data, Path) else len(data)
     store, key = place(path, size)
     send = lambda: obstore_module().put(store, key, data, chunk_size=PART, max_concurrency=1)
-    ask(path, send, "write", _turn(size))
+    ask(path, send, "write", _turns(size))
 
 
-def _turn(size: int) -> BoundedSemaphore | None:
+def _turns(size: int) -> Turns | None:
     """Return what a request that sends this many bytes waits for."""
-    return SEND_TURN if size > MUCH else None
+    return SENDING_MUCH if size > MUCH else None
 
 
 def put_if(path: Path, data: bytes, there: Version | None) -> Version | None:
@@ -105,7 +104,7 @@ def put_if(path: Path, data: bytes, there: Version | None) -> Version | None:
             return None
 
     try:
-        if made := ask(path, request, "write", _turn(len(data))):
+        if made := ask(path, request, "write", _turns(len(data))):
             return made
         now = get(path)
     except FileNotFoundError:

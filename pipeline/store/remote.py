@@ -20,7 +20,7 @@ from levelproof.pipeline.store.pieces import PieceCache
 from levelproof.pipeline.store.requests import (
     MUCH,
     PATIENCE,
-    RECEIVE_TURN,
+    RECEIVING,
     REQUESTS,
     RESENDING,
     RETRIES,
@@ -143,11 +143,6 @@ def fragments_in(folder: Path) -> dict[Path, Stored]:
             f"There is no split at {as_typed(folder.parent)}, or it has no index: a split on a web "
             f"server needs {folder.name}/{INDEX}, which `levelproof seal` writes."
         ) from None
-    if not text:
-        raise UserError(
-            f"A command writes to the split at {as_typed(folder.parent)}, or was stopped before it was uploaded: run "
-            "`levelproof seal` on its folder, and upload it again."
-        )
     return {folder / name: Stored("", 0) for name in text.decode(errors="replace").split() if "/" not in name}
 
 
@@ -219,11 +214,10 @@ class RemoteFile:
             answer = obstore_module().get(store, key, options=options)
             return answer.meta, data_of(answer, last - first)
 
-        about, data = ask(self.path, request, turn=RECEIVE_TURN)
+        about, data = ask(self.path, request, turns=RECEIVING)
         tag = self._about.tag if self.path.parts[0] in HUB else _tag(about)  # the hub's file servers use other tags
         if (tag, about["size"], len(data)) != (*self._about, last - first):
-            if folder := _folder_of(self.path):
-                _known.pop(folder, None)
+            forget(_folder_of(self.path) or self.path)
             raise FileChanged(f"{as_typed(self.path)} has changed")
         for i, n in enumerate(run):
             self._cache.put(self._piece(n), data[i * PIECE : (i + 1) * PIECE])
@@ -239,18 +233,21 @@ def _folder_of(path: Path) -> Path | None:
     return shard or (path.parent if path.parent.name in LISTED else None)
 
 
+def forget(path: Path) -> None:
+    """Ask for a folder's or file's metadata anew when it is next needed."""
+    _known.pop(path, None)
+
+
 def stored_at(path: Path) -> Stored:
-    """Return a file's metadata: as listed with its shard or fragment, otherwise as the store has it now.
+    """Return a file's metadata: as listed with its shard or fragment, or as first asked for; see `forget`.
 
     Raises: as `RemoteFile`.
     """
     folder = _folder_of(path)
-    if folder is None:
-        return _asked(path)
-    files = _known.get(folder)
+    files = _known.get(folder or path)
     if files is None:
-        files = _known[folder] = stored_in(folder) if is_listed(path) else {}
-    if path not in files and not is_listed(path):
+        files = _known[folder or path] = stored_in(folder) if folder and is_listed(path) else {}
+    if path not in files and not (folder and is_listed(path)):
         files[path] = _asked(path)
     if path not in files:
         raise FileNotFoundError(as_typed(path))
@@ -266,7 +263,12 @@ def _asked(path: Path) -> Stored:
         if key not in listed:
             raise FileNotFoundError(as_typed(path))
         return Stored(*listed[key])
-    about = ask(path, lambda: obstore_module().head(store, key))
+    try:
+        about = ask(path, lambda: obstore_module().head(store, key))
+    except FileNotFoundError:
+        if path.parts[0] in BUCKETS:  # the answer has no text, which would tell whether there is such a bucket
+            ask(path, lambda: obstore_module().get_range(store, key, start=0, length=1))
+        raise
     return Stored(_tag(about), about["size"])
 
 
@@ -294,8 +296,12 @@ def place(path: Path, sent: int = 0) -> tuple["ObjectStore", str]:
         return _store("hf:", repository), key
     if len(path.parts) < 2:
         raise UserError(f"The URL {as_typed(path)} names no split: give one such as s3://bucket/data/128k/s.")
-    key = "/".join(path.parts[2:])  # obstore quotes it in requests, and would quote a URL's %20 twice
-    return _store(path.parts[0], path.parts[1], sent > MUCH), unquote(key) if path.parts[0] in WEB else key
+    key = "/".join(path.parts[2:])
+    if path.parts[0] in WEB:  # obstore quotes keys in requests, and would quote a URL's %20 twice
+        key = unquote(key)
+        if not key.isprintable() or {".", ".."} & {*key.split("/")}:
+            raise FileNotFoundError(as_typed(path))
+    return _store(path.parts[0], path.parts[1], sent > MUCH), key
 
 
 @lru_cache(maxsize=64)

@@ -3,8 +3,9 @@
 import random
 import re
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from datetime import timedelta
 from itertools import count
 from pathlib import Path
@@ -15,8 +16,7 @@ from levelproof.pipeline.errors import LevelproofError, StoreFailure, UserError
 from levelproof.pipeline.urls import as_typed
 
 REQUESTS = 16  # concurrent
-SENDS = 4  # concurrent requests that send much; a link of 0.6 Mbit/s sends their parts within SENDING
-RECEIVE_TURN, SEND_TURN = BoundedSemaphore(REQUESTS), BoundedSemaphore(SENDS)  # of this process
+SENDS = 2  # concurrent requests that send much; a link of 0.6 Mbit/s sends their parts within SENDING
 MUCH = 2**18  # bytes of a request that waits for its turn to send; less is sent by REQUESTS requests within a minute
 STREAMED = 2**20  # bytes of a response that are taken at once
 RETRIES: dict[str, Any] = {
@@ -33,7 +33,8 @@ PATIENCE = {
     "timeout": timedelta(hours=6),
     "allow_http": True,
 }
-SENDING = timedelta(minutes=10)  # `read_timeout` of requests that send much
+# `read_timeout` of requests that send much; TRIES of them end before their worker counts as silent
+SENDING = timedelta(minutes=5)
 RESENDING = timedelta(minutes=5)  # their `retry_timeout`: obstore signs them once, and signatures expire
 SIGN_IN = {
     "s3:": "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for a public bucket",
@@ -49,6 +50,34 @@ CUT_OFF, SILENT = "response body error", "HTTP error"  # a response ends early; 
 CLOUD = re.compile(r"latest/api/token|computeMetadata")  # endpoints where a cloud's machines get credentials
 
 T = TypeVar("T")
+
+
+class Turns:
+    """Limits the requests that a process makes at once. When one fails for good, those that wait for a turn do, too."""
+
+    def __init__(self, most: int) -> None:
+        self._free, self._failed = BoundedSemaphore(most), Counter[Path]()
+
+    @contextmanager
+    def turn(self, path: Path) -> Iterator[None]:
+        """Wait for a turn, and hold it during the block, which makes a request and repeats it.
+
+        Raises:
+            StoreFailure: the block does, or a request to the same host or bucket did so meanwhile.
+        """
+        place = Path(*path.parts[:2])
+        before = self._failed[place]
+        with self._free:
+            if self._failed[place] > before:
+                raise StoreFailure(f"Cannot reach {as_typed(path)}, as another request has found: check the network.")
+            try:
+                yield
+            except StoreFailure:
+                self._failed[place] += 1
+                raise
+
+
+RECEIVING, SENDING_MUCH = Turns(REQUESTS), Turns(SENDS)  # of this process
 
 
 def obstore_module() -> Any:
@@ -72,22 +101,26 @@ def data_of(answer: Any, most: float) -> bytes:
     return bytes(data)
 
 
-def ask(path: Path, request: Callable[[], T], what: str = "read", turn: AbstractContextManager[Any] | None = None) -> T:
+def ask(path: Path, request: Callable[[], T], what: str = "read", turns: Turns | None = None) -> T:
     """Make a request, and retry it if the response is cut off or missing, in cases that obstore does not retry.
 
-    obstore seldom retries cut-off responses, and never requests that it does not know to be idempotent. `turn` is
-    RECEIVE_TURN or SEND_TURN for requests with much data; others, such as those that renew a lease, wait for none.
+    obstore seldom retries cut-off responses, and never requests that it does not know to be idempotent. `turns` are
+    RECEIVING or SENDING_MUCH for requests with much data; others, such as those that renew a lease, wait for none.
 
     Raises:
         FileNotFoundError: the store has no such file.
         UserError: it has no such bucket, or does not allow us to `what`.
         StoreFailure: it does not answer.
     """
+    with turns.turn(path) if turns else nullcontext():
+        return _repeated(path, request, what)
+
+
+def _repeated(path: Path, request: Callable[[], T], what: str) -> T:
     exceptions, end = obstore_module().exceptions, time.monotonic() + RETRIES["retry_timeout"].total_seconds()
     for attempt in count():
         try:
-            with turn or nullcontext():
-                return request()
+            return request()
         except FileNotFoundError as error:
             if NO_BUCKET in str(error):
                 raise _explained(path, str(error), what) from None

@@ -10,8 +10,8 @@ from pathlib import Path
 from levelproof.configs.schema import REMOVED, JobConfig
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.store.disk import explaining_writes, flush_entry, write_new
-from levelproof.pipeline.store.files import write
 from levelproof.pipeline.store.layout import EVENTS, FOLDERS, INDEX_FILE, JOB, MANIFEST, entries, split_path
+from levelproof.pipeline.store.leases import require_served
 from levelproof.pipeline.store.leftovers import clean
 from levelproof.pipeline.store.locks import committing, only_writer
 from levelproof.pipeline.store.manifest import Manifest, changes_text, differences, write_index
@@ -56,20 +56,19 @@ def writing(job: JobConfig, say: Callable[[str], None], split: Path | None = Non
 
 @contextmanager
 def taken(split: Path, say: Callable[[str], None], indexed: bool = False) -> Iterator[Manifest]:
-    """Lock and clean a split; yield its manifest. At the end write its index, if `indexed` or if it had one.
+    """Lock and clean a split; yield its manifest. Then write its index anew, if `indexed` or if it has one.
 
-    Until then, or until the next command ends if this one does not end well, the index is empty.
+    Until then, and if the `with` block raises, the index is that of before, which may name fragments that are gone.
 
     Raises:
         UserError: it cannot be written or locked, or is being written.
         Failure: a fragment is damaged.
+        LeaseLost: another command has taken the split over.
     """
     with locked(split, say):
-        indices = entries(split, MANIFEST, INDEX_FILE, DirEntry.is_file)
-        for index in indices:
-            write(index, b"")
         yield clean(split, say)
-        if indexed or indices:
+        if indexed or entries(split, MANIFEST, INDEX_FILE, DirEntry.is_file):
+            require_served(split)
             write_index(split)
 
 

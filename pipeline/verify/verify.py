@@ -117,7 +117,7 @@ def examine(
         if not findings.wrong or fragment_files(split) == findings.examined:
             return findings
     there = fragment_files(split)
-    return _summed(split, [group for group in groups if there.issuperset(group.files)], console)
+    return _summed(split, [group for group in groups if there.issuperset(group.files)], console, complete=False)
 
 
 def _examined(split: Path, before: Sequence[FragmentGroup], console: Console | None) -> list[FragmentGroup]:
@@ -148,8 +148,8 @@ def _examined(split: Path, before: Sequence[FragmentGroup], console: Console | N
     return groups
 
 
-def _summed(split: Path, groups: Sequence[FragmentGroup], console: Console | None) -> Findings:
-    """Join the findings of groups, and add what only the whole split shows."""
+def _summed(split: Path, groups: Sequence[FragmentGroup], console: Console | None, complete: bool = True) -> Findings:
+    """Join the findings of groups, and add what only the whole split shows if they are `complete` and none writes."""
     findings = Findings()
     note = _note(split, findings)
     for group in groups:
@@ -160,7 +160,7 @@ def _summed(split: Path, groups: Sequence[FragmentGroup], console: Console | Non
     present = np.unique(np.concatenate([np.zeros(0, np.int64), *(ids for group in groups for ids in group.ids)]))
     findings.present = runs(present)
     say = lambda text: console and console.print(text, highlight=False, markup=False, soft_wrap=True)
-    running = is_written(split, say)
+    running = not complete or is_written(split, say)
     _find_lost_levels(split, note, present, named, running, findings)
     if note and not running:
         missing = without(without(note.level_ids.tolist(), present), np.array(sorted(findings.lost), np.int64))

@@ -80,7 +80,7 @@ def test_cached_works_without_a_folder(folder: Path) -> None:
 
 
 @pytest.fixture
-def source(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def source(folder: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Replace the kernels' sources by one file; this process begins an hour later."""
     path = tmp_path_factory.mktemp("sources") / "one.py"
     path.write_text("source")

@@ -3,11 +3,13 @@
 import json
 import os
 import pickle
+import re
 import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from datetime import timedelta
 from itertools import count
@@ -292,6 +294,7 @@ def test_read_fails_in_bounded_time_when_the_store_dies(bucket: Bucket, monkeypa
     [
         ("s3://bucket/data/none", {}, UserError, "There is no split at s3://bucket/data/none"),
         ("s3://nobody/data/s", {}, UserError, "There is no bucket 'nobody': check s3://nobody/data/s"),
+        ("s3://nobody/levels.parquet", {}, UserError, "There is no bucket 'nobody': check s3://nobody/levels.parquet"),
         ("s3://bucket/data/s", {"AWS_ENDPOINT_URL": f"http://{HOST}:1"}, StoreFailure, r"\(it does not answer\)"),
         ("hf://models/user/name", {}, UserError, "hf://models/user/name/manifest is not the URL of a dataset"),
         ("s3://bucket/data/s", {"LEVELPROOF_CACHE_GB": "much"}, UserError, "LEVELPROOF_CACHE_GB is 'much'"),
@@ -472,28 +475,52 @@ def test_revision_of_the_hub_with_a_slash_is_quoted_once(
         require_same(Path("hf://datasets/user/name@refs%2Fpr%2F1/1M/s"), split)
 
 
-def test_stale_index_on_a_web_server_is_not_read(split: Path, tmp_path: Path) -> None:
+def test_index_for_web_servers_follows_the_split(split: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(split, tmp_path / "s"))
-    index, gone = folder / MANIFEST / "index.txt", fragment_paths(folder)[0]
+    index, (gone, *_) = folder / MANIFEST / "index.txt", fragment_paths(folder)
     with taken(folder, print):
         pass
     assert not index.exists(), "it had none before"
     write_index(folder)
     old = index.read_bytes()
-    gone.unlink()
+    with pytest.raises(UserError), taken(folder, print):
+        raise UserError("another configuration")
+    assert index.read_bytes() == old, "a refused command changes nothing"
     with serving(files_of(tmp_path)) as server:
         there = Path(f"{server.url}/s")
-        with pytest.raises(KeyboardInterrupt), taken(folder, print):  # as a command that makes more levels, or seals
-            raise KeyboardInterrupt
-        with pytest.raises(UserError, match=f"writes to the split at {server.url}/s, or was stopped before it was upl"):
-            read_manifest(there)
-        index.write_bytes(old)
-        words = f"index {server.url}/s/manifest/index.txt names {gone.name}, which is not there: run `levelproof seal`"
-        with pytest.raises(Failure, match=words):
-            read_manifest(there)
         with taken(folder, print):
-            pass
+            gone.unlink()
+            words = f"/s/manifest/index.txt names {gone.name}, which is not there: run `levelproof seal`"
+            with pytest.raises(Failure, match=re.escape(words)):
+                read_manifest(there)
         assert read_manifest(there, []).level_ids.tolist() == read_manifest(folder, []).level_ids.tolist()
+
+
+def test_names_that_leave_the_folder_of_a_web_server_are_not_found() -> None:
+    for name in ("%2e%2e/x", "shards/%2E%2E/x", "a%0Ab"):
+        with pytest.raises(FileNotFoundError):
+            remote.place(Path(f"http:/localhost:1/data/{name}"))
+
+
+def test_requests_that_wait_for_a_turn_fail_with_the_one_that_has_it() -> None:
+    """A silent store would otherwise be asked by one after another, each as patient as the first."""
+    turns, asked = requests.Turns(1), list[int]()
+
+    def silent(number: int) -> None:
+        asked.append(number)
+        time.sleep(0.2)
+        raise StoreFailure("it does not answer")
+
+    def ask(number: int) -> None:
+        with pytest.raises(StoreFailure, match=r"it does not answer|as another request has found"):
+            requests.ask(Path(f"s3:/bucket/{number}"), lambda: silent(number), turns=turns)
+
+    with ThreadPoolExecutor(16) as threads:
+        list(threads.map(ask, range(16)))
+    assert 1 <= len(asked) < 16
+    before = len(asked)
+    ask(16)
+    assert len(asked) == before + 1, "one that did not wait is made"
 
 
 def test_split_on_the_hub_reads_as_its_folder(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
