@@ -31,7 +31,7 @@ from levelproof.pipeline.store.formats import CONFIG_KEY, DENSITIES_KEY, DIGESTS
 from levelproof.pipeline.store.fragment import FULL, Fragment, read_fragment
 from levelproof.pipeline.store.layout import FRAGMENT, JOB, MANIFEST, Attempt, entries, ids_of
 from levelproof.pipeline.store.progress_bar import ProgressBar
-from levelproof.pipeline.store.remote import INDEX, as_typed, is_listed, is_remote
+from levelproof.pipeline.store.remote import INDEX, is_listed, is_remote, stale_index
 from levelproof.pipeline.store.runs import ascending
 from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.store.seed.rows import seed_parts
@@ -255,7 +255,7 @@ def _parts(
     lists the folder again until a listing finds no new sealed fragment, and no listed one that is missing when read.
     """
     parts_read: dict[tuple[Path, int], tuple[Fragment, pa.Table]] = {}
-    missing: list[str] = []
+    missing: list[Path] = []
     with ThreadPoolExecutor(THREADS) as threads:
         for listing in range(MAX_LISTINGS):
             listed = entries(split, MANIFEST, FRAGMENT, DirEntry.is_file).items()
@@ -265,16 +265,13 @@ def _parts(
                 for part in threads.map(read, (path for path, _ in new)):
                     parts.append(part)
                     bar.advance(1)
-            missing = [path.name for (path, _), part in zip(new, parts, strict=True) if not part]
+            missing = [path for (path, _), part in zip(new, parts, strict=True) if not part]
             parts_read |= {entry: part for entry, part in zip(new, parts, strict=True) if part}
             if listing and all(part and not part[0].sealed for part in parts):
                 latest = {path: part for (path, _), part in parts_read.items()}  # a path's file may have been replaced
                 return [latest[path] for path in sorted(latest) if latest[path][0].rows]  # fences have no rows
     if missing and not is_listed(split):
-        raise Failure(
-            f"The index {as_typed(split / MANIFEST / INDEX)} names {missing[0]}, which is not there: run `levelproof "
-            "seal` on the split's folder, and upload it again."
-        )
+        raise Failure(stale_index(missing[0]))
     raise Failure(f"The fragments of {split} change faster than they can be read: try again after the writer ends.")
 
 

@@ -6,10 +6,11 @@ A split's Path may stand for a URL: `is_remote` says whether it does, and `place
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from urllib.parse import unquote
 
@@ -38,6 +39,7 @@ INDEX = "index.txt"  # in the manifest's folder: names of the fragments, for ser
 MAX_INDEX = 2**25  # bytes of it; a name takes 34
 PIECE = 2**20  # bytes; with 4 MB, random reads of 10 kB trajectories would fetch four times as much
 MAX_PIECES = 8  # adjacent pieces that one request fetches
+CONTROL = re.compile(r"[\x00-\x1f\x7f]")  # characters that no key may have
 LISTED = "manifest", "experts"  # folders of a split whose files are looked up together
 MAX_WHOLE = 2**29  # bytes of a file that is read as a whole, such as a fragment
 CACHE_GB = "LEVELPROOF_CACHE_GB"
@@ -87,8 +89,23 @@ def at_once(path: Path, work: Callable[..., T], *items: Iterable[Any]) -> list[T
     """Map `work` over items; if the path is remote, in threads, so that requests overlap."""
     if not is_remote(path):
         return list(map(work, *items))
+    failed = Event()
+
+    def unless_failed(*item: Any) -> T:
+        if failed.is_set():  # the executor begins items until its reader sees the first failure
+            raise CancelledError
+        try:
+            return work(*item)
+        except BaseException:
+            failed.set()
+            raise
+
     with ThreadPoolExecutor(REQUESTS) as threads:
-        return list(threads.map(work, *items))
+        futures = [threads.submit(unless_failed, *item) for item in zip(*items, strict=False)]
+    errors = [error for future in futures if (error := future.exception())]
+    if errors:
+        raise next((error for error in errors if not isinstance(error, CancelledError)), errors[0])
+    return [future.result() for future in futures]
 
 
 def stored_in(folder: Path) -> dict[Path, Stored]:
@@ -123,6 +140,14 @@ def names_in(folder: Path) -> list[Path]:
     ]
 
 
+def stale_index(path: Path) -> str:
+    """Say that a web server's index names a fragment that is not there."""
+    return (
+        f"The index {as_typed(path.parent / INDEX)} names {path.name}, which is not there: run `levelproof seal` on "
+        "the split's folder, and upload it again."
+    )
+
+
 def fragments_in(folder: Path) -> dict[Path, Stored]:
     """List the manifest's folder, and drop cached metadata of the split's other files.
 
@@ -135,8 +160,8 @@ def fragments_in(folder: Path) -> dict[Path, Stored]:
     if folder.parts[0] not in WEB:
         listing = _known[folder] = stored_in(folder)
         return listing
-    store, key = place(folder / INDEX)
     try:
+        store, key = place(folder / INDEX)
         text = ask(folder / INDEX, lambda: data_of(obstore_module().get(store, key), MAX_INDEX))
     except FileNotFoundError:
         raise UserError(
@@ -217,7 +242,7 @@ class RemoteFile:
         about, data = ask(self.path, request, turns=RECEIVING)
         tag = self._about.tag if self.path.parts[0] in HUB else _tag(about)  # the hub's file servers use other tags
         if (tag, about["size"], len(data)) != (*self._about, last - first):
-            forget(_folder_of(self.path) or self.path)
+            forget(self.path)
             raise FileChanged(f"{as_typed(self.path)} has changed")
         for i, n in enumerate(run):
             self._cache.put(self._piece(n), data[i * PIECE : (i + 1) * PIECE])
@@ -235,7 +260,7 @@ def _folder_of(path: Path) -> Path | None:
 
 def forget(path: Path) -> None:
     """Ask for a folder's or file's metadata anew when it is next needed."""
-    _known.pop(path, None)
+    _known.pop(_folder_of(path) or path, None)
 
 
 def stored_at(path: Path) -> Stored:
@@ -299,7 +324,7 @@ def place(path: Path, sent: int = 0) -> tuple["ObjectStore", str]:
     key = "/".join(path.parts[2:])
     if path.parts[0] in WEB:  # obstore quotes keys in requests, and would quote a URL's %20 twice
         key = unquote(key)
-        if not key.isprintable() or {".", ".."} & {*key.split("/")}:
+        if CONTROL.search(key) or {".", ".."} & {*key.split("/")}:
             raise FileNotFoundError(as_typed(path))
     return _store(path.parts[0], path.parts[1], sent > MUCH), key
 

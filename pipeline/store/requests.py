@@ -3,7 +3,6 @@
 import random
 import re
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from datetime import timedelta
@@ -52,28 +51,35 @@ CLOUD = re.compile(r"latest/api/token|computeMetadata")  # endpoints where a clo
 T = TypeVar("T")
 
 
+class StoreSilent(StoreFailure):
+    """A store does not answer, or no more bytes of its answer arrive."""
+
+
 class Turns:
-    """Limits the requests that a process makes at once. When one fails for good, those that wait for a turn do, too."""
+    """Limits the requests that a process makes at once. If one is never answered, those that wait for a turn fail, too.
+
+    Each would otherwise be as patient as the first, one turn after another.
+    """
 
     def __init__(self, most: int) -> None:
-        self._free, self._failed = BoundedSemaphore(most), Counter[Path]()
+        self._free, self._failed = BoundedSemaphore(most), dict[Path, StoreSilent]()  # by host or bucket: the latest
 
     @contextmanager
     def turn(self, path: Path) -> Iterator[None]:
         """Wait for a turn, and hold it during the block, which makes a request and repeats it.
 
         Raises:
-            StoreFailure: the block does, or a request to the same host or bucket did so meanwhile.
+            StoreSilent: a request to the same host or bucket was given up meanwhile.
         """
         place = Path(*path.parts[:2])
-        before = self._failed[place]
+        before = self._failed.get(place)
         with self._free:
-            if self._failed[place] > before:
-                raise StoreFailure(f"Cannot reach {as_typed(path)}, as another request has found: check the network.")
+            if (failed := self._failed.get(place)) and failed is not before:
+                raise StoreSilent(*failed.args)
             try:
                 yield
-            except StoreFailure:
-                self._failed[place] += 1
+            except StoreSilent as silent:
+                self._failed[place] = silent
                 raise
 
 
@@ -148,4 +154,5 @@ def _explained(path: Path, text: str, what: str) -> LevelproofError:
     if reason.startswith(("401", "403")):
         return UserError(f"The store does not let you {what} {url} ({reason}): {how}.")
     then = "run the same command again; what is committed stays" if what == "write" else "try again"
-    return StoreFailure(f"Cannot {what} {url} ({reason}): check the network and the URL, and {then}.")
+    kind = StoreSilent if SILENT in text or CUT_OFF in text else StoreFailure
+    return kind(f"Cannot {what} {url} ({reason}): check the network and the URL, and {then}.")

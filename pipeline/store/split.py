@@ -3,12 +3,12 @@
 import os
 import secrets
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from os import DirEntry
 from pathlib import Path
 
 from levelproof.configs.schema import REMOVED, JobConfig
-from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.errors import LevelproofError, UserError
 from levelproof.pipeline.store.disk import explaining_writes, flush_entry, write_new
 from levelproof.pipeline.store.layout import EVENTS, FOLDERS, INDEX_FILE, JOB, MANIFEST, entries, split_path
 from levelproof.pipeline.store.leases import require_served
@@ -58,7 +58,7 @@ def writing(job: JobConfig, say: Callable[[str], None], split: Path | None = Non
 def taken(split: Path, say: Callable[[str], None], indexed: bool = False) -> Iterator[Manifest]:
     """Lock and clean a split; yield its manifest. Then write its index anew, if `indexed` or if it has one.
 
-    Until then, and if the `with` block raises, the index is that of before, which may name fragments that are gone.
+    Until then, and after a kill, the index may name fragments that are gone.
 
     Raises:
         UserError: it cannot be written or locked, or is being written.
@@ -66,10 +66,19 @@ def taken(split: Path, say: Callable[[str], None], indexed: bool = False) -> Ite
         LeaseLost: another command has taken the split over.
     """
     with locked(split, say):
-        yield clean(split, say)
-        if indexed or entries(split, MANIFEST, INDEX_FILE, DirEntry.is_file):
-            require_served(split)
-            write_index(split)
+        try:
+            yield clean(split, say)
+        except BaseException:
+            with suppress(LevelproofError, OSError):
+                _write_index(split, indexed=False)
+            raise
+        _write_index(split, indexed)
+
+
+def _write_index(split: Path, indexed: bool) -> None:
+    if indexed or entries(split, MANIFEST, INDEX_FILE, DirEntry.is_file):
+        require_served(split)
+        write_index(split)
 
 
 @contextmanager

@@ -58,7 +58,7 @@ from levelproof.pipeline.store.manifest import (
 from levelproof.pipeline.store.named import open_shard
 from levelproof.pipeline.store.origins import RECORD, origin_of
 from levelproof.pipeline.store.progress_bar import ProgressBar
-from levelproof.pipeline.store.remote import is_remote
+from levelproof.pipeline.store.remote import is_listed, is_remote, stale_index
 from levelproof.pipeline.store.runs import runs, runs_text, without
 from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.store.shard import Shard
@@ -222,6 +222,8 @@ def _part(path: Path) -> Part:
             raise Failure(f"The fragment {path} is not what was committed: its bytes have changed.")
         fragment, rows = read_fragment(path, ["level_id", *COLUMNS])
     except (OSError, MemoryError) as error:
+        if isinstance(error, FileNotFoundError) and not is_listed(path):
+            raise DataUnread(stale_index(path)) from None
         if machines := unread(path, error):
             raise machines from None
         raise Failure(f"The fragment {path} is missing or damaged ({type(error).__name__}).") from None

@@ -38,6 +38,7 @@ from levelproof.pipeline.store.layout import FRAGMENT, MANIFEST, WRITER_LOCK, en
 from levelproof.pipeline.store.leases import is_leased
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, require_manifest, write_index
 from levelproof.pipeline.store.split import taken
+from levelproof.pipeline.verify.verify import examine
 from tests.pace import patience, wait_until
 from tests.pipeline.command import ROOT, assert_refused, line_of
 from tests.pipeline.command import here as command
@@ -485,15 +486,25 @@ def test_index_for_web_servers_follows_the_split(split: Path, tmp_path: Path) ->
     old = index.read_bytes()
     with pytest.raises(UserError), taken(folder, print):
         raise UserError("another configuration")
-    assert index.read_bytes() == old, "a refused command changes nothing"
+    assert index.read_bytes() == old
     with serving(files_of(tmp_path)) as server:
         there = Path(f"{server.url}/s")
         with taken(folder, print):
             gone.unlink()
             words = f"/s/manifest/index.txt names {gone.name}, which is not there: run `levelproof seal`"
-            with pytest.raises(Failure, match=re.escape(words)):
-                read_manifest(there)
+            for reads in read_manifest, examine:
+                with pytest.raises(Failure, match=re.escape(words)):
+                    reads(there)
         assert read_manifest(there, []).level_ids.tolist() == read_manifest(folder, []).level_ids.tolist()
+        gone = fragment_paths(folder)[0]
+        with pytest.raises(KeyboardInterrupt), taken(folder, print):
+            stop_without(gone)
+        assert read_manifest(there, []).level_ids.tolist() == read_manifest(folder, []).level_ids.tolist()
+
+
+def stop_without(fragment: Path) -> None:
+    fragment.unlink()
+    raise KeyboardInterrupt
 
 
 def test_names_that_leave_the_folder_of_a_web_server_are_not_found() -> None:
@@ -504,23 +515,25 @@ def test_names_that_leave_the_folder_of_a_web_server_are_not_found() -> None:
 
 def test_requests_that_wait_for_a_turn_fail_with_the_one_that_has_it() -> None:
     """A silent store would otherwise be asked by one after another, each as patient as the first."""
-    turns, asked = requests.Turns(1), list[int]()
+    turns, asked = requests.Turns(1), list[str]()
 
-    def silent(number: int) -> None:
-        asked.append(number)
-        time.sleep(0.2)
-        raise StoreFailure("it does not answer")
+    def refused(path: Path, error: type[StoreFailure]) -> None:
+        asked.append(path.name)
+        time.sleep(0.1)
+        raise error(f"{path.name} failed")
 
-    def ask(number: int) -> None:
-        with pytest.raises(StoreFailure, match=r"it does not answer|as another request has found"):
-            requests.ask(Path(f"s3:/bucket/{number}"), lambda: silent(number), turns=turns)
+    def ask(path: Path, error: type[StoreFailure] = requests.StoreSilent) -> None:
+        requests.ask(path, lambda: refused(path, error), turns=turns)
 
-    with ThreadPoolExecutor(16) as threads:
-        list(threads.map(ask, range(16)))
-    assert 1 <= len(asked) < 16
-    before = len(asked)
-    ask(16)
-    assert len(asked) == before + 1, "one that did not wait is made"
+    paths = [Path(f"s3:/bucket/{number}") for number in range(40)]
+    with pytest.raises(StoreFailure, match="failed"):
+        remote.at_once(paths[0], ask, paths)
+    assert len(asked) <= 2, "those of other threads that waited, and those that were queued, are not made"
+    asked.clear()
+    with ThreadPoolExecutor(4) as threads:
+        each = [threads.submit(ask, path, StoreFailure) for path in paths[:4]]
+        assert {str(one.exception()) for one in each} == {f"{number} failed" for number in range(4)}
+    assert len(asked) == 4, "an answer, even a refusal, says nothing of other requests"
 
 
 def test_split_on_the_hub_reads_as_its_folder(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
