@@ -113,11 +113,11 @@ def run(args: argparse.Namespace) -> Report:
     rows += [row_of(name, ("", "", "", "", ""), players, name) for name in PLAYERS if name in players[ALL]]
     shown = {each["way"] for each in results}
     size = "" if args.size == "s" else args.size
-    hours = f"{args.core_seconds / HOUR:g}h" if args.core_seconds > HOUR else ""
-    page = "_".join(filter(None, ("equal", size, hours)))
+    hours = f"{args.core_seconds / HOUR:g}" if args.core_seconds > HOUR else ""
+    page = "_".join(filter(None, ("equal", size, hours and f"{hours}h")))
     head = ("policy", "seed", "pace", "env steps", "core-seconds before training", "in all", *SHARES)
     return Report(
-        ", ".join(filter(None, ("Learners at equal cost", size and f"size {size}", hours and f"{hours} of a core"))),
+        ", ".join(filter(None, ("Learners at equal cost", size and f"size {size}", hours and f"{hours} core-hours"))),
         results,
         [
             Table(head, rows, f"Share of sealed levels of {args.size} solved with sampled actions; 95% intervals"),
