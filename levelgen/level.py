@@ -73,7 +73,7 @@ class Level:
             IndexError: there is no such level.
         """
         chosen = np.atleast_1d(np.arange(len(self))[index])
-        return jax.tree.map(lambda x: x[..., chosen], _expanded(self))
+        return jax.tree.map(lambda x: x[..., chosen], expanded(self))
 
 
 def concatenate_levels(parts: Sequence[Level]) -> Level:
@@ -86,10 +86,10 @@ def concatenate_levels(parts: Sequence[Level]) -> Level:
     if len(sizes) != 1:
         names = ", ".join(map(name_of, sizes))
         raise ValueError(f"levels of the sizes {names} cannot be joined" if sizes else "there are no levels to join")
-    return jax.tree.map(lambda *lanes: np.concatenate(lanes, -1), *map(_expanded, parts))
+    return jax.tree.map(lambda *lanes: np.concatenate(lanes, -1), *map(expanded, parts))
 
 
-def _expanded(level: Level) -> Level:
+def expanded(level: Level) -> Level:
     """Return numpy views of all arrays with as many lanes as the level has."""
     lanes = len(level)
     expand = lambda x: np.broadcast_to(x, (*x.shape[:-1], lanes))  # in numpy: JAX would compile each shape

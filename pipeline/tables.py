@@ -14,8 +14,8 @@ def console_for_tables() -> Console:
     return console
 
 
-def print_table(table: Table, console: Console) -> None:
-    """Print a table; cells too long for a terminal continue on the next line."""
+def folded(table: Table) -> Table:
+    """Let cells that are too long for a terminal continue on the next line; return the table."""
     for column in table.columns:
         column.overflow, column.no_wrap = "fold", False
-    console.print(table)
+    return table

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.levelgen.batching import by_blocks, take
-from levelproof.levelgen.level import ACTIONS, Level
+from levelproof.levelgen.level import ACTIONS, Level, expanded
 from levelproof.levelgen.programs import jit_sooner
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import controls
@@ -56,7 +56,7 @@ def replay(level: Level, action: ArrayLike, rules: TaskParams = DEFAULT_RULES) -
     Raises:
         ValueError: there are no levels, or the actions have another shape.
     """
-    level, actions = level[:], np.asarray(action, np.int32)
+    level, actions = expanded(level), np.asarray(action, np.int32)
     count = len(level)
     if not count or actions.shape != (RECORD_STEPS, ACTIONS, count):
         raise ValueError(

@@ -93,6 +93,7 @@ def _sources(folder: Path) -> tuple[str, float]:
     """Return a hash of a folder's sources, names and bytes, and when the last of them changed."""
     digest, changed = hashlib.sha256(), 0.0
     for path in sorted(folder.rglob("*.py")):
-        digest.update(f"{path.relative_to(folder)} {path.stat().st_size}\n".encode() + path.read_bytes())
-        changed = max(changed, path.stat().st_mtime, path.stat().st_ctime)  # a copy may keep its original's mtime
+        about = path.stat()
+        digest.update(f"{path.relative_to(folder)} {about.st_size}\n".encode() + path.read_bytes())
+        changed = max(changed, about.st_mtime, about.st_ctime)  # a copy may keep its original's mtime
     return digest.hexdigest(), changed

@@ -36,7 +36,7 @@ from levelproof.pipeline.read.agents import Agent, agent_in
 from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.progress_bar import ProgressBar
-from levelproof.pipeline.tables import console_for_tables, print_table
+from levelproof.pipeline.tables import console_for_tables, folded
 from levelproof.pipeline.words import many
 
 ATTEMPTS = 8
@@ -290,7 +290,7 @@ def _print(facts: dict[str, Any], attempts: int, console: Console) -> None:
             table.add_row(name, *(_shown_rate(rates[key]) for key in ("once", "best", "worst")), steps)
         for name, rate in facts["published"].items() if title == ALL else ():
             table.add_row(name, f"{rate:.0%}", "-", "-", "-")
-        print_table(table, console)
+        console.print(folded(table))
         if apart := facts.get("difference", {}).get(title):
             low, high = (f"{100 * x:+.1f}" for x in apart["interval"])
             ours = AGENT if AGENT in players else POLICY

@@ -23,7 +23,7 @@ from levelproof.pipeline.look.query import prepare_for_seeds
 from levelproof.pipeline.read.select import columns_in, labelled, select
 from levelproof.pipeline.store.manifest import Manifest, changes_text, differences, require_manifest
 from levelproof.pipeline.store.remote import as_typed
-from levelproof.pipeline.tables import console_for_tables, print_table
+from levelproof.pipeline.tables import console_for_tables, folded
 from levelproof.pipeline.words import number
 
 READ = (*cost.READ, "content_hash", "signature", "steps_to_goal", *SPENT)
@@ -179,7 +179,7 @@ def _print(facts: dict[str, Any], console: Console) -> None:
             here, there = (side[quantile] for side in steps["quantiles"])
             name = "median" if quantile == "50%" else quantile
             table.add_row(f"steps to goal, {name}", f"{here:,.0f}", f"{there:,.0f}", f"{there - here:+,.0f}")
-    print_table(table, console)
+    console.print(folded(table))
     say = lambda text: console.print(text, soft_wrap=not console.is_terminal)
     say("")
     one_sided = [

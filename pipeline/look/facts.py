@@ -9,7 +9,7 @@ from rich.table import Table
 
 from levelproof.pipeline.look import cost, duplicates
 from levelproof.pipeline.look.entities import ENTITIES
-from levelproof.pipeline.tables import print_table
+from levelproof.pipeline.tables import folded
 
 NAMES = 33  # characters; column where the text of a line begins
 REASONS = 4  # shown per label; the rest are only counted
@@ -34,7 +34,7 @@ def print_facts(facts: Mapping[str, Any], shown: Sequence[str], console: Console
         table.add_row(*(_cell(row[name]) for name in shown))
     if facts["rows"]:
         console.print()
-        print_table(table, console)
+        console.print(folded(table))
 
 
 def _lines(facts: Mapping[str, Any]) -> dict[str, str | list[str]]:

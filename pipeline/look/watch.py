@@ -22,6 +22,7 @@ from levelproof.pipeline.store.layout import EVENTS
 from levelproof.pipeline.store.locks import is_written
 from levelproof.pipeline.store.progress_bar import LINE_EVERY
 from levelproof.pipeline.store.remote import as_typed
+from levelproof.pipeline.tables import folded
 from levelproof.pipeline.words import duration, many
 
 INTERVAL = 2.0  # s between refreshes
@@ -111,6 +112,4 @@ def progress_table(facts: dict[str, Any]) -> Table:
     }
     for name, text in lines.items():
         table.add_row(readable(name), readable(text))
-    for column in table.columns:
-        column.overflow = "fold"
-    return table
+    return folded(table)

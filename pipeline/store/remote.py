@@ -6,11 +6,10 @@ A split's Path may stand for a URL: `is_remote` says whether it does, and `place
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
-from threading import Event
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from urllib.parse import unquote
 
@@ -89,23 +88,21 @@ def at_once(path: Path, work: Callable[..., T], *items: Iterable[Any]) -> list[T
     """Map `work` over items; if the path is remote, in threads, so that requests overlap."""
     if not is_remote(path):
         return list(map(work, *items))
-    failed = Event()
+    failures: list[BaseException] = []
 
-    def unless_failed(*item: Any) -> T:
-        if failed.is_set():  # the executor begins items until its reader sees the first failure
-            raise CancelledError
-        try:
-            return work(*item)
-        except BaseException:
-            failed.set()
-            raise
+    def unless_failed(*item: Any) -> Any:
+        if not failures:  # the executor would begin further items until its reader sees the first failure
+            try:
+                return work(*item)
+            except BaseException as error:
+                failures.append(error)
+        return None
 
     with ThreadPoolExecutor(REQUESTS) as threads:
-        futures = [threads.submit(unless_failed, *item) for item in zip(*items, strict=False)]
-    errors = [error for future in futures if (error := future.exception())]
-    if errors:
-        raise next((error for error in errors if not isinstance(error, CancelledError)), errors[0])
-    return [future.result() for future in futures]
+        results = list(threads.map(unless_failed, *items))
+    if failures:
+        raise failures[0]
+    return results
 
 
 def stored_in(folder: Path) -> dict[Path, Stored]:
@@ -269,13 +266,14 @@ def stored_at(path: Path) -> Stored:
     Raises: as `RemoteFile`.
     """
     folder = _folder_of(path)
-    files = _known.get(folder or path)
+    key, listed = folder or path, folder is not None and is_listed(path)
+    files = _known.get(key)
     if files is None:
-        files = _known[folder or path] = stored_in(folder) if folder and is_listed(path) else {}
-    if path not in files and not (folder and is_listed(path)):
-        files[path] = _asked(path)
+        files = _known[key] = stored_in(key) if listed else {}
     if path not in files:
-        raise FileNotFoundError(as_typed(path))
+        if listed:
+            raise FileNotFoundError(as_typed(path))
+        files[path] = _asked(path)
     return files[path]
 
 

@@ -8,7 +8,7 @@ from os import DirEntry
 from pathlib import Path
 
 from levelproof.configs.schema import REMOVED, JobConfig
-from levelproof.pipeline.errors import LevelproofError, UserError
+from levelproof.pipeline.errors import LevelproofError, StoreFailure, UserError
 from levelproof.pipeline.store.disk import explaining_writes, flush_entry, write_new
 from levelproof.pipeline.store.layout import EVENTS, FOLDERS, INDEX_FILE, JOB, MANIFEST, entries, split_path
 from levelproof.pipeline.store.leases import require_served
@@ -68,6 +68,8 @@ def taken(split: Path, say: Callable[[str], None], indexed: bool = False) -> Ite
     with locked(split, say):
         try:
             yield clean(split, say)
+        except StoreFailure:
+            raise  # to ask a store again that does not answer would take minutes
         except BaseException:
             with suppress(LevelproofError, OSError):
                 _write_index(split, indexed=False)

@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from levelproof.pipeline.tables import console_for_tables, print_table
+from levelproof.pipeline.tables import console_for_tables, folded
 
 PATH = "/data/experiments/" + "x" * 150 + "/128k/s"
 
@@ -19,7 +19,7 @@ def table() -> Table:
 
 
 def test_long_cell_is_whole_in_a_pipe(capsys: pytest.CaptureFixture[str]) -> None:
-    print_table(table(), console_for_tables())
+    console_for_tables().print(folded(table()))
     header, row = capsys.readouterr().out.splitlines()
     assert row.split() == ["7", PATH]
     assert len(header) < 200
@@ -27,6 +27,6 @@ def test_long_cell_is_whole_in_a_pipe(capsys: pytest.CaptureFixture[str]) -> Non
 
 def test_long_cell_continues_on_the_next_lines_of_a_terminal() -> None:
     text = io.StringIO()
-    print_table(table(), Console(file=text, width=80, force_terminal=True, color_system=None))
+    Console(file=text, width=80, force_terminal=True, color_system=None).print(folded(table()))
     _, first, *others = text.getvalue().splitlines()
     assert "".join([first.split()[1], *(line.strip() for line in others)]) == PATH

@@ -21,7 +21,7 @@ from levelproof.pipeline.store.bounds import DAMAGE
 from levelproof.pipeline.store.columns import COLUMNS, REPETITIVE, schema_of
 from levelproof.pipeline.store.fragment import Fragment
 from levelproof.pipeline.store.progress_bar import shown_blocks
-from levelproof.pipeline.store.remote import absolute, as_typed, forget, is_remote
+from levelproof.pipeline.store.remote import absolute, as_typed, forget
 from levelproof.pipeline.store.seed.columns import KEPT
 from levelproof.pipeline.store.seed.file import SeedFile, damaged_seed, read_seed, seed_files
 from levelproof.pipeline.store.seed.source import LevelSource
@@ -53,8 +53,7 @@ def seed_parts(
     """
     parts = []
     for path in seed_files(source):
-        if is_remote(path):
-            forget(path)  # it may have been replaced since it was last opened
+        forget(path)  # a remote one may have been replaced since it was last opened
         wanted = [name for column in names for name in MADE_FROM.get(column, ())]
         about, rows = read_seed(path, wanted, level_ids, compact=True)
         rows = rows.append_column("row", pa.array(_positions(path, rows, about), pa.int32()))
