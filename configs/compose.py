@@ -20,8 +20,8 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from levelproof.configs.convert import flat, nested, plain, typed
-from levelproof.configs.errors import ConfigError, suggestion, warn_of_name
-from levelproof.configs.schema import RENAMED, REPEATED, JobConfig, from_files, hash_of
+from levelproof.configs.errors import ConfigError, suggestion
+from levelproof.configs.schema import REPEATED, JobConfig, from_files, hash_of
 from levelproof.levelgen.sampling.distribution import Distribution
 
 if TYPE_CHECKING:
@@ -165,14 +165,8 @@ def _compose(overrides: list[str]) -> dict[str, Any]:
 
 
 def _parse(text: str) -> Override:
-    """Parse one `key=value`; take a value that Hydra's grammar cannot read (`out=my data/é`) as a plain string.
-
-    If the key is a setting's name in the previous version, warns and uses today's name.
-    """
+    """Parse one `key=value`; take a value that Hydra's grammar cannot read (`out=my data/é`) as a plain string."""
     key, equals, value = text.partition("=")
-    if new := RENAMED.get(key):
-        warn_of_name("the setting", key, new)
-        key, text = new, f"{new}={value}"
     quoted = f"{key}={QuotedString(value, Quote.single).with_quotes()}"
     verbatim = key in VERBATIM and value[:1] not in "'\""
     for attempt in (quoted if verbatim else text, quoted) if key and equals else ():

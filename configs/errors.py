@@ -1,9 +1,7 @@
 """Errors in settings, and their messages."""
 
 import difflib
-import warnings
 from collections.abc import Iterable
-from functools import cache
 
 MAX_LENGTH = 800  # characters of a message
 
@@ -19,12 +17,6 @@ def readable(message: str) -> str:
     """Return a message as one line of bounded length, without control characters, whatever it quotes."""
     line = "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in message)
     return line if len(line) <= MAX_LENGTH else f"{line[: MAX_LENGTH // 2]} ... {line[-MAX_LENGTH // 2 :]}"
-
-
-@cache
-def warn_of_name(what: str, old: str, new: str) -> None:
-    """Warn, once per process, that something has a new name."""
-    warnings.warn(f"{what} {old} is now {new}; the next version accepts only the new name", FutureWarning, stacklevel=1)
 
 
 def suggestion(word: str, known: Iterable[str]) -> str:

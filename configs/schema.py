@@ -54,7 +54,7 @@ WITHOUT_EFFECT = frozenset(
         "search.rounds",
     }
 )
-# Today's dotted names of settings by their names in earlier versions; overrides may use those for one version
+# Today's dotted names of settings by their names in earlier versions
 RENAMED: Mapping[str, str] = {
     "expert.moved_attempts": "expert.perturbed_attempts",
     "search.anew": "search.new_action",

@@ -36,9 +36,8 @@ def run(arguments: argparse.Namespace) -> None:
     import sys
 
     from levelproof.pipeline.look.query import RowQuery, write_csv
-    from levelproof.pipeline.store.columns import with_current_names
 
-    names = with_current_names(arguments.columns).split(",") if arguments.columns else None
+    names = arguments.columns.split(",") if arguments.columns else None
     columns = names and list(dict.fromkeys(name.strip() for name in names))
     _require_effect(arguments)
     query = RowQuery(arguments.where, columns, arguments.sort, arguments.limit)

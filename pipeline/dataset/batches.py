@@ -10,7 +10,6 @@ from levelproof.pipeline.dataset.order import EpochOrder
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.runtime import own_cores
 
-RENAMED = {"batch": "batch_size", "part": "subset"}  # old names in states saved by the previous version
 FINISHED = 2  # maximum number of batches finished ahead of the caller: the next and the one after
 T = TypeVar("T")
 
@@ -149,7 +148,7 @@ def _position_in(start: Any, settings: Mapping[str, Any]) -> int:
     try:
         if type(position := start["position"]) is not int or position < 0:
             raise ValueError
-        saved = {RENAMED.get(name, name): value for name, value in dict(start["of"]).items()}
+        saved = dict(start["of"])
         differing = [name for name in settings if saved[name] != settings[name]]
     except (KeyError, TypeError, ValueError):
         raise UserError("The start is not a state of batches: pass what their state() returned.") from None

@@ -35,7 +35,6 @@ from levelproof.pipeline.dataset.episodes import GOAL, EpisodeBatch, gather_epis
 from levelproof.pipeline.dataset.observations import observe, parse_observation
 from levelproof.pipeline.dataset.order import EpochOrder, as_int
 from levelproof.pipeline.dataset.records import Records, loaded_together
-from levelproof.pipeline.dataset.renamed import renamed
 from levelproof.pipeline.dataset.sources import TrajectorySource
 from levelproof.pipeline.dataset.subsets import check_share, in_subset
 from levelproof.pipeline.dataset.trajectories import TrajectoryRows
@@ -142,7 +141,6 @@ class Dataset:
         batch = self.read([index % len(self)], fields=["level", "record"])
         return jax.tree.map(lambda x: x[0], batch)
 
-    @renamed(numbers="indices")
     def read(
         self,
         indices: ArrayLike,
@@ -182,7 +180,6 @@ class Dataset:
         live = np.broadcast_to(effective, arrays["record/action"].shape)
         return batch_of(arrays, level_id, starts, mask, shown, live, chosen)
 
-    @renamed(batch="batch_size", part="subset", ahead="prefetch")
     def batches(
         self,
         batch_size: int,
@@ -297,7 +294,6 @@ class Dataset:
         settings = self._settings(subset=subset, episodes="first")
         return batches_of(load, order, settings, epochs, prefetch, start, together)
 
-    @renamed(part="subset")
     def grain(
         self,
         subset: str | None = None,
@@ -319,7 +315,6 @@ class Dataset:
 
     torch = grain
 
-    @renamed(numbers="indices")
     def levels(self, indices: ArrayLike) -> Level:
         """Read the levels of trajectories, for `levelproof.make`: numpy arrays, level axis last, in the given order.
 
@@ -333,7 +328,6 @@ class Dataset:
         arrays = self._arrays(in_a_row(indices, "indices"), expand_fields(["level"], self.size))
         return jax.tree.map(lambda x: np.ascontiguousarray(np.moveaxis(x, 0, -1)), tree_of(Level, arrays, "level/"))
 
-    @renamed(number="index")
     def state(self, index: ArrayLike, step: ArrayLike = 0) -> EnvState:
         """Return the environment's state before a step of a trajectory, as jax arrays; its `level_index` is the index.
 

@@ -1,6 +1,5 @@
 """Training a split's levels at another budget: `levelproof regenerate manifest=data/256k/s budget=1M`."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -42,7 +41,6 @@ def regenerate(arguments: Sequence[str], console: Console) -> Exit:
     """
     own, settings = split_arguments(arguments)
     source, where = Path(own["manifest"]).expanduser(), own.get("where")
-    columns_in(where)  # warns of old names, in this process
     # To hash the levels of seeds, JAX starts
     chosen = in_another_process(_chosen, source, where) if is_seed(source) else _chosen(source, where)
     config, level_ids, origins = chosen
@@ -61,7 +59,6 @@ def _chosen(source: Path, where: str | None) -> tuple[Mapping[str, Any], list[in
     """
     if is_seed(source):
         prepare_jax(device="cpu")
-        warnings.simplefilter("ignore", FutureWarning)  # of old names: the command's process has warned of them
     manifest = require_manifest(source, columns_in(where))
     config = manifest.config or {}
     if not from_files(config) and config["sampler_version"] != SAMPLER_VERSION:

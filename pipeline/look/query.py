@@ -15,7 +15,7 @@ from levelproof.pipeline.look.cost import with_known_costs
 from levelproof.pipeline.outlet import has_reader
 from levelproof.pipeline.read.select import columns_in, ids_by, select
 from levelproof.pipeline.runtime import prepare_jax
-from levelproof.pipeline.store.columns import COLUMNS, with_current_names
+from levelproof.pipeline.store.columns import COLUMNS
 from levelproof.pipeline.store.manifest import require_manifest
 from levelproof.pipeline.store.progress_bar import ProgressBar
 from levelproof.pipeline.store.seed.file import is_seed
@@ -50,7 +50,7 @@ def ids_of(table: pa.Table, query: RowQuery) -> np.ndarray:
     """
     ids = table.column("level_id").to_numpy()
     if query.sort is not None:
-        clause = f"ORDER BY {with_current_names(query.sort)}\n NULLS LAST, level_id"
+        clause = f"ORDER BY {query.sort}\n NULLS LAST, level_id"
         ids = ids_by(table, clause, f"sort by {query.sort!r}", "give a column, or one such as 'steps_to_goal DESC'")
     return ids if query.limit is None else ids[: query.limit]
 

@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 from jaxtyping import Bool
 
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.store.columns import COLUMNS, with_current_names
+from levelproof.pipeline.store.columns import COLUMNS
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 
 SOLVED = "label = 'solved'"  # default condition of exports
@@ -22,7 +22,7 @@ WILDCARDS = {TABLE, "columns"}  # words that may refer to every column in DuckDB
 
 def columns_in(where: str | None) -> list[str]:
     """Return the columns that a condition may refer to: those whose names are among its words."""
-    words = set(re.findall(r"\w+", with_current_names(where or "").lower()))
+    words = set(re.findall(r"\w+", (where or "").lower()))
     return [name for name in COLUMNS.names if name in words or words & WILDCARDS]
 
 
@@ -39,7 +39,7 @@ def select(table: pa.Table, where: str | None) -> pa.Table:
     if where is None:
         return table
     advice = f"it is SQL over the columns {', '.join(COLUMNS.names)}"
-    chosen = ids_by(table, f"WHERE ({with_current_names(where)}\n)", f"use the condition {where!r}", advice)
+    chosen = ids_by(table, f"WHERE ({where}\n)", f"use the condition {where!r}", advice)
     return table.filter(np.isin(table.column("level_id").to_numpy(), chosen))
 
 

@@ -3,13 +3,11 @@
 Readers refuse a fragment of an unknown version instead of guessing.
 """
 
-import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import pyarrow as pa
 
-from levelproof.configs.errors import warn_of_name
 from levelproof.experts.steps import Seconds
 
 MANIFEST_VERSION, OLDEST_VERSION = 9, 6  # written; still read
@@ -234,12 +232,3 @@ def completed(table: pa.Table, requested: Sequence[str]) -> pa.Table:
         if column.name in requested and column.name not in table.column_names:
             table = table.append_column(COLUMNS.field(column.name), pa.nulls(table.num_rows, column.type))
     return table
-
-
-def with_current_names(text: str) -> str:
-    """Replace the previous version's column names, in SQL or alone, by today's; warn of each."""
-    for old, new in RENAMED.items():
-        text, found = re.subn(rf"\b{old}\b", new, text, flags=re.IGNORECASE)
-        if found:
-            warn_of_name("the column", old, new)
-    return text

@@ -25,7 +25,7 @@ from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.store import files
 from levelproof.pipeline.store.bounds import Bounded, with_dictionaries
 from levelproof.pipeline.store.checksums import digests_below, with_own
-from levelproof.pipeline.store.columns import COLUMNS, MANIFEST_VERSION, schema_of, with_current_names
+from levelproof.pipeline.store.columns import COLUMNS, MANIFEST_VERSION, schema_of
 from levelproof.pipeline.store.disk import flush, flush_entry, regular
 from levelproof.pipeline.store.formats import CONFIG_KEY, DENSITIES_KEY, DIGESTS_KEY, HASH_KEY, SEALED_KEY, VERSION_KEY
 from levelproof.pipeline.store.fragment import FULL, Fragment, read_fragment
@@ -217,7 +217,7 @@ def read_manifest(
         Failure: a fragment is damaged, or fragments have different configurations.
     """
     split, columns = Path(split), [columns] if isinstance(columns, str) else columns
-    names = COLUMNS.names if columns is None else list(dict.fromkeys(["level_id", *map(with_current_names, columns)]))
+    names = COLUMNS.names if columns is None else list(dict.fromkeys(["level_id", *columns]))
     if unknown := [name for name in names if name not in COLUMNS.names]:
         raise UserError(f"There is no column {unknown[0]!r}: the manifest has {', '.join(COLUMNS.names)}.")
     requested = None if level_ids is None else ascending(np.asarray(level_ids, np.int64))

@@ -22,7 +22,7 @@ from levelproof.configs.compose import (
     shortest_command,
 )
 from levelproof.configs.convert import flat, nested, plain
-from levelproof.configs.errors import ConfigError, warn_of_name
+from levelproof.configs.errors import ConfigError
 from levelproof.configs.meanings import every_setting
 from levelproof.configs.schema import ADDED, RENAMED, WITHOUT_EFFECT, GrowConfig, ImportConfig, decisive, hash_of
 from levelproof.experts.config import ExpertConfig
@@ -150,16 +150,6 @@ def test_job_hash_ignores_settings_of_the_machine() -> None:
     """Tests of experts/pool and experts/search show that these two change no result."""
     machine = {setting.name for setting in every_setting() if setting.group.endswith(": machine")}
     assert machine == {name for name in WITHOUT_EFFECT if "." in name} == {"expert.slots", "search.rounds"}
-
-
-@pytest.mark.parametrize("old", RENAMED)
-def test_compose_job_accepts_old_names_of_settings_with_a_warning(old: str) -> None:
-    new, value = RENAMED[old], "[0.25]" if old == "search.redrawn" else "1"
-    warn_of_name.cache_clear()
-    with pytest.warns(FutureWarning) as warned:
-        job = compose_job([f"{old}={value}"])
-    assert [str(each.message).partition(";")[0] for each in warned] == [f"the setting {old} is now {new}"]
-    assert job == compose_job([f"{new}={value}"]) != compose_job([])
 
 
 def test_decisive_takes_stored_settings_for_those_of_today() -> None:

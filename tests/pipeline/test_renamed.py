@@ -1,4 +1,4 @@
-"""Splits, seed files and command lines with the names of the last version: they mean what they meant."""
+"""Splits and seed files with the names of the last version: they mean what they meant."""
 
 import json
 import shutil
@@ -13,7 +13,6 @@ from rich.console import Console
 
 import levelproof
 from levelproof.configs.compose import compose_job
-from levelproof.configs.errors import warn_of_name
 from levelproof.configs.schema import RENAMED, decisive, hash_of
 from levelproof.experts.labels import Label
 from levelproof.pipeline.errors import Exit
@@ -103,24 +102,6 @@ def test_old_name_in_a_fragment_of_today_is_damage(old: Path) -> None:
         pq.write_table(table.replace_schema_metadata(table.schema.metadata | {VERSION_KEY: b"9"}), path)
     with pytest.raises(levelproof.LevelproofError, match="is damaged"):
         read_manifest(old)
-
-
-@pytest.mark.parametrize("of", ["new", "old", "seed"])
-def test_queries_accept_the_old_column_with_one_warning(of: str, request: pytest.FixtureRequest) -> None:
-    split = str(request.getfixturevalue(of))
-    query = lambda name: ["inspect", split, "--csv", "--columns", f"level_id, {name}", "--sort", f"{name} DESC"]
-    both = lambda name: here([*query(name), "--where", f"{name} IS NULL OR {name} > 0.5"], Path())
-    warn_of_name.cache_clear()
-    before, now = both(OLD), both(NEW)
-    assert before.stdout == now.stdout
-    assert before.stdout.startswith(f"level_id,{NEW}\n0,")
-    assert (before.returncode, now.stderr) == (0, "")
-    warning = f"Warning: the column {OLD} is now {NEW}; the next version accepts only the new name\n"
-    assert before.stderr == warning
-    warn_of_name.cache_clear()
-    with pytest.warns(FutureWarning, match=NEW):
-        data = levelproof.open(split, where=f"{OLD.upper()} > 0.5", columns=[OLD])
-    assert NEW in data.manifest.column_names
 
 
 def test_old_split_continues(old: Path) -> None:

@@ -87,24 +87,6 @@ def test_timed_out_marks_episodes_as_long_as_the_limit() -> None:
     assert_same(timed_out(done, goal, 4), expected)
 
 
-def test_old_argument_names_still_work_and_warn(data: Dataset) -> None:
-    plain = {"seed": 1, "observation": None}
-    with pytest.warns(DeprecationWarning, match="of batches is now") as warned:
-        old = data.batches(**{"batch": 8, "part": "train", "ahead": 1} | plain)  # type: ignore[call-arg]
-    assert {Path(warning.filename).name for warning in warned} == {"test_dataset.py"}
-    new = data.batches(batch_size=8, subset="train", prefetch=1, **plain)
-    assert_same(next(old).level_id, next(new).level_id)
-    position = new.state()
-    before = position["of"] | {"batch": 8, "part": "train"}
-    del before["batch_size"], before["subset"]
-    again = data.batches(8, subset="train", start={"position": position["position"], "of": before}, **plain)
-    assert_same(next(again).level_id, next(new).level_id)
-    with pytest.warns(DeprecationWarning, match="numbers= of read is now indices="):
-        assert_same(data.read(numbers=[1], observation=None).level_id, data.read([1], observation=None).level_id)  # type: ignore[call-arg]
-    with pytest.raises(TypeError, match=r"batches got batch_size= and batch=, its old name"):
-        data.batches(batch_size=8, batch=8)  # type: ignore[call-arg]
-
-
 def test_read_cuts_windows_from_trajectories(data: Dataset) -> None:
     cut = data.read([3, 1], length=10, first=[250, 4], fields=["record/state"], observation=None)
     whole = data.read([3, 1], fields=["record/state"], observation=None)
