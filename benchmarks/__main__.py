@@ -60,7 +60,6 @@ BENCHMARKS = {  # name: (module, what it measures)
     "agents": ("benchmarks.agents", "how policies play the levels of the reference's published agents"),
     "cold": ("benchmarks.cold", "how long the first levels take with nothing compiled, and the next ones"),
     "cost": ("benchmarks.cost", "what a solved level costs, and how many are solved, beside an earlier commit"),
-    "readme": ("benchmarks.readme", "the README's commands in a fresh clone and environment"),
 }
 
 
