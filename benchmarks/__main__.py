@@ -55,7 +55,7 @@ BENCHMARKS = {  # name: (module, what it measures)
     "gallery": ("benchmarks.gallery", "how soon a gallery of many levels appears, and how smoothly it scrolls"),
     "reader": ("benchmarks.reader", "trajectories/s of both readers on the same trajectories"),
     "seeds": ("benchmarks.seeds", "bytes of seeds, and transitions/s read from them and from a disk"),
-    "workers": ("benchmarks.workers", "how much faster two workers are than one, and what a thousand cost the driver"),
+    "workers": ("benchmarks.workers", "how much faster two workers are than one"),
     "cloning": ("benchmarks.cloning", "how cloned policies solve unseen levels, against the number of levels"),
     "agents": ("benchmarks.agents", "how policies play the levels of the reference's published agents"),
     "cold": ("benchmarks.cold", "how long the first levels take with nothing compiled, and the next ones"),

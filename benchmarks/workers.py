@@ -1,18 +1,15 @@
-"""Speedup of two workers over one, on two cores; and the driver's cost for a thousand workers.
+"""Speedup of two workers over one, on two cores.
 
 The speedup is of the same job with `workers=1` and `workers=2`, in turns, from the start of the first worker until all
 is committed. That excludes the start of Ray and Python, but includes loading compiled programs and the tail, when one
 worker is idle. Its upper bound is measured beside it: a worker's loop without Ray or a driver, in one process and in
-two at once, which only the shared machine slows down. The driver's cost is the scheduler's alone, with simulated
-workers: its seconds and bytes for handing out all units and handling all reports.
+two at once, which only the shared machine slows down.
 """
 
 import argparse
-import heapq
 import multiprocessing
 import tempfile
 import time
-import tracemalloc
 from collections.abc import Callable, Sequence
 from itertools import islice
 from pathlib import Path
@@ -25,18 +22,13 @@ from benchmarks.report import Report, Table
 from levelproof.configs.compose import compose_job
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs.progress import Board, Tally
-from levelproof.pipeline.jobs.schedule import ROUND, STRETCH, Order, Round, Scheduler, UnitOutcome, WorkUnit, plan_units
+from levelproof.pipeline.jobs.schedule import ROUND, STRETCH, Order, Scheduler, UnitOutcome, WorkUnit, plan_units
 from levelproof.pipeline.runtime import own_cores, prepare_jax
 from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store.split import writing
 
-UNIT = 32  # levels
-WORKERS, UNITS = 1_000, (2_000, 20_000, 200_000)  # simulated
-SECONDS = 6.0  # mean time of a simulated unit; every worker has its own rate
-POLL = 0.25  # s
 LOAD_TIMEOUT = 600.0  # s that a process waits for the others to load their programs
 TIMED_UNITS = 8  # units that a process times, after one that loads its programs
-SPREAD = 0.5  # standard deviation of the logarithm of workers' rates
 
 
 class Timed(Scheduler):
@@ -53,52 +45,34 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", default="s", help="default: s")
     parser.add_argument("--budget", default="64k", help="default: 64k")
     parser.add_argument("--levels", type=int, default=1024, help="levels of the job; default: 1024")
-    parser.add_argument("--repeats", type=int, default=2, help="pairs of runs; default: 2; 0: only the scheduler")
+    parser.add_argument("--repeats", type=int, default=2, help="pairs of runs; default: 2")
 
 
 def run(args: argparse.Namespace) -> Report:
     if len(own_cores()) < 2:
         raise UserError("Two workers need two cores: run this on a machine that has them.")
-    simulated = [simulate(units) for units in UNITS]
     settings = [f"size={args.size}", f"budget={args.budget}", f"levels={args.levels}", "first_level=1000000"]
     pairs = [tuple(args.levels / seconds_of(settings, workers) for workers in (1, 2)) for _ in range(args.repeats)]
     ratios = [two / one for one, two in pairs]
     shared = [tuple(side_by_side(settings, processes) for processes in (1, 2)) for _ in range(2 * args.repeats)]
     bounds = [2 * one / two for one, two in shared]
-    results = [{"workers": WORKERS, **result} for result in simulated]
-    results += [{"size": args.size, "budget": args.budget, "one": one, "two": two} for one, two in pairs]
+    results = [{"size": args.size, "budget": args.budget, "one": one, "two": two} for one, two in pairs]
     results += [{"size": args.size, "budget": args.budget, "alone": one, "beside": two} for one, two in shared]
     rows = [[f"{one:.2f}", f"{two:.2f}", f"{two / one:.2f}"] for one, two in pairs]
     apart = [[f"{one:.1f}", f"{two:.1f}", f"{result:.2f}"] for (one, two), result in zip(shared, bounds, strict=True)]
-    of_driver = [
-        [
-            f"{result['units']:,}",
-            f"{1e6 * result['seconds'] / result['units']:.0f}",
-            f"{result['share']:.1%}",
-            f"{result['bytes'] / 1e6:.1f}",
-        ]
-        for result in simulated
-    ]
     return Report(
-        title="One worker, two workers, a thousand",
+        title="One worker and two",
         results=results,
         tables=[
             Table(("levels/s, one worker", "two workers", "ratio"), rows, f"A job of {args.levels} levels of size "
                   f"{args.size}, {args.budget} env steps each, on two cores"),
             Table(("s, one process", "each of two at once", "two for one"), apart, f"{TIMED_UNITS} units of the job in "
                   "processes that share nothing but the machine"),
-            Table(
-                ("units", "driver, µs per unit", "share of one core", "peak MB"),
-                of_driver,
-                f"The scheduler with {WORKERS:,} simulated workers, units of {UNIT} levels and {SECONDS:.0f} s",
-            ),
         ],
         notes=[
             f"Two workers are {np.median(ratios):.2f} times as fast as one, two processes that share nothing "
             f"{np.median(bounds):.2f} times{' (medians)' * (args.repeats > 1)}."
-        ]
-        if ratios
-        else [],
+        ],
     )  # fmt: skip
 
 
@@ -180,50 +154,3 @@ def require_done(outcomes: Sequence[UnitOutcome]) -> None:
     for outcome in outcomes:
         if not outcome.summary:
             raise Failure(outcome.reason)
-
-
-def simulate(units: int) -> dict[str, float]:
-    """Measure the scheduler on `units` units of WORKERS workers, one of which dies per thousand units."""
-    seconds, simulated = schedule(units)
-    tracemalloc.start()  # in a run of its own, because tracing is slow
-    schedule(units)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    return {"units": units, "seconds": seconds, "bytes": peak, "share": seconds / simulated}
-
-
-def schedule(units: int) -> tuple[float, float]:
-    """Return the scheduler's seconds, and the simulated seconds of the job."""
-    rng, levels = np.random.default_rng(0), units * UNIT
-    rates = np.exp(rng.normal(0, SPREAD, WORKERS)) * UNIT / SECONDS  # levels/s
-    scheduler = Scheduler(plan_units(range(levels), [], UNIT), levels, UNIT)
-    done, worked, now, share_at = np.zeros(WORKERS), 0.0, 0.0, 0.0  # levels since each worker's last unit ended
-    events = [(float(first), worker) for worker, first in enumerate(rng.random(WORKERS))]
-    heapq.heapify(events)
-    for _, worker in events:
-        scheduler.join(worker, 0.0)
-    while not scheduler.over:
-        now, worker = heapq.heappop(events)
-        done[worker] += rates[worker] * ROUND
-        start = time.process_time()
-        ended, running = [], dict(scheduler.workers[worker].units)
-        for unit in running:
-            if len(unit.level_ids) > done[worker]:
-                break
-            done[worker] -= len(unit.level_ids)
-            ended.append(UnitOutcome(unit))
-        if rng.random() < ROUND / SECONDS / 1000:
-            for outcome in scheduler.lost(worker, "died"):
-                scheduler.failed(outcome.unit)
-            scheduler.join(worker, now)
-        else:
-            scheduler.report(worker, Round(ended, {}, wants=UNIT // 4 if len(running) - len(ended) < 2 else 0), now)
-        if now >= share_at:  # as the driver does, several times a second
-            share_at = now + POLL
-            scheduler.share()
-        scheduler.order(worker, now)
-        worked += time.process_time() - start
-        if not scheduler.workers[worker].units:
-            done[worker] = 0.0
-        heapq.heappush(events, (now + ROUND, worker))
-    return worked, now
