@@ -16,7 +16,6 @@ from jaxtyping import Bool, Int
 from PIL import Image
 
 from benchmarks.report import Report, Table
-from benchmarks.statistics import wilson
 from levelproof.configs.compose import compose_job
 from levelproof.experts.labels import Source
 from levelproof.experts.search.config import SearchConfig
@@ -33,6 +32,7 @@ from levelproof.levelgen.pictures.words import Caption
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.physics.types import FIXED_POLYGONS
+from levelproof.pipeline.look.figures import Share
 from levelproof.pipeline.runtime import own_cores, prepare_jax
 
 REPLAYS = 128  # of each solution, from starts perturbed by a rounding error
@@ -135,7 +135,7 @@ def groups(found: Found) -> list[list[str]]:
         f"more than {counted(middle[1], 'joint')}": joints > middle[1],
     }
     share = lambda some, of: (
-        f"{some} ({some / max(of, 1):.0%}, {' to '.join(f'{x:.0%}' for x in wilson(some, max(of, 1)))})"
+        f"{some} ({some / max(of, 1):.0%}, {' to '.join(f'{x:.0%}' for x in Share(some, of).interval)})"
     )
     rows = []
     for name, these in kinds.items():

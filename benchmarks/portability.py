@@ -17,7 +17,6 @@ from jaxtyping import Bool, Float, Int
 
 from benchmarks import oracle
 from benchmarks.report import Report, Table
-from benchmarks.statistics import wilson
 from levelproof.experts.config import RECORD_STEPS, ExpertConfig
 from levelproof.experts.labels import Label
 from levelproof.experts.pool.pool import Pool
@@ -31,6 +30,7 @@ from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.look.figures import Share
 from levelproof.pipeline.runtime import prepare_jax
 
 BUDGET = 64_000  # env steps of an expert
@@ -122,7 +122,7 @@ def result(size: str, levels: int, played: Played) -> dict:
         survived_all = reached[portability == 1]
         kinds[kind] = {
             "reach_the_goal": share(reached),
-            "interval": wilson(int(reached.sum()), len(reached)),
+            "interval": Share(int(reached.sum()), len(reached)).interval,
             "portability": float(portability.mean()),
             "survive_all": len(survived_all) / len(reached),
             "reach_the_goal_of_those": share(survived_all),

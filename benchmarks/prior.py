@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from benchmarks.report import Report, Table
-from benchmarks.statistics import wilson
 from levelproof.experts.evaluation import FirstEpisodes, play, play_sampled
 from levelproof.experts.labels import Label
 from levelproof.experts.networks.saved import Policy
 from levelproof.levelgen.level import Level, name_of
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.look.figures import Share
 from levelproof.pipeline.read.levels import COLUMNS, levels_of, rules_of
 from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.runtime import prepare_jax
@@ -68,8 +68,8 @@ def run(args: argparse.Namespace) -> Report:
             [
                 one["size"],
                 f"`{one['policy']}`",
-                share(one["found_of_unsolved"], one["unsolved"]),
-                share(one["found_of_solved"], one["solved"]),
+                found_of(one["found_of_unsolved"], one["unsolved"]),
+                found_of(one["found_of_solved"], one["solved"]),
                 f"{one['steps_ratio']:.2f}",
             ]
         )
@@ -180,6 +180,5 @@ def timed(policy: Policy, some: Undecided, attempts: int) -> tuple[FirstEpisodes
     return played, (ends[-1][1] - ends[0][1]) * count / after if after else float("nan")
 
 
-def share(some: int, of: int) -> str:
-    low, high = wilson(some, of)
-    return f"{some} of {of}, {some / max(of, 1):.1%} ({low:.1%} to {high:.1%})"
+def found_of(found: int, levels: int) -> str:
+    return f"{found} of {levels}, {Share(found, levels)}"

@@ -21,7 +21,6 @@ from scipy.stats import chi2
 from benchmarks.oracle import log
 from benchmarks.plotting import pyplot, save
 from benchmarks.report import Report, Table
-from benchmarks.statistics import wilson
 from levelproof.configs.numbers import parse_count
 from levelproof.experts.config import MAX_COUNTED
 from levelproof.experts.search.config import SearchConfig
@@ -37,6 +36,7 @@ from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.physics.step import ENGINE_VERSION
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.look.figures import Share
 from levelproof.pipeline.runtime import cache_folder, own_cores, prepare_jax
 
 FIRST = 1_000_000  # first level id; the search was tuned on others
@@ -199,7 +199,7 @@ def result(size: str, steps: Int[np.ndarray, " level"], env_steps: int) -> dict[
         "levels": len(steps),
         "env_steps": env_steps,
         "unsolved": float((steps < 0).mean()),
-        "interval": wilson(int((steps < 0).sum()), len(steps)),
+        "interval": Share(int((steps < 0).sum()), len(steps)).interval,
         "last_doubling": last,
         "next_doubling_at_most": upper(last) / len(steps),
         "found_after": sorted(int(n) for n in steps if n >= 0),
@@ -229,11 +229,10 @@ def remainder(steps_by_size: Mapping[str, Int[np.ndarray, " level"]], max_steps:
 
 def row(size: str, steps: Int[np.ndarray, " level"], env_steps: int) -> Sequence[str]:
     summary = result(size, steps, env_steps)
-    low, high = summary["interval"]
     return (
         size,
         f"{env_steps:,}",
-        f"{summary['unsolved']:.1%} ({low:.1%} to {high:.1%})",
+        str(Share(int((steps < 0).sum()), len(steps))),
         f"{summary['last_doubling']} of {len(steps)} levels",
         f"{summary['next_doubling_at_most']:.1%} of the levels",
     )
@@ -246,7 +245,7 @@ def draw(path: Path, steps_by_size: Mapping[str, Int[np.ndarray, " level"]], max
     for size, steps in steps_by_size.items():
         budgets = doublings(max_steps[size])
         counts = [int(unsolved(steps, n).sum()) for n in budgets]
-        low, high = 100 * np.array([wilson(count, len(steps)) for count in counts]).T
+        low, high = 100 * np.array([Share(count, len(steps)).interval for count in counts]).T
         axes.plot(budgets, 100 * np.array(counts) / len(steps), "o-", color=COLOURS[size], label=size, markersize=3)
         axes.fill_between(budgets, low, high, color=COLOURS[size], alpha=0.15, linewidth=0)
     axes.set(xscale="log", ylim=(0, None), xlabel="env steps of search, a level", ylabel="unsolved, %")

@@ -1,4 +1,4 @@
-"""Confidence intervals and tests for benchmarks, from scipy and statsmodels."""
+"""Statistical tests for benchmarks, from scipy and statsmodels."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -6,14 +6,6 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 from statsmodels.stats.multitest import multipletests
-
-
-def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """Return the 95% interval of a share (Wilson 1927)."""
-    if not trials:
-        return 0.0, 1.0
-    low, high = binomtest(successes, trials).proportion_ci(method="wilson")
-    return float(low), float(high)
 
 
 def too_few(successes: int, trials: int, share: float) -> bool:

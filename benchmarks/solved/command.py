@@ -11,12 +11,12 @@ from benchmarks.report import Report
 from benchmarks.solved import larger, measure, original, plot, tables
 from benchmarks.solved.results import FILE, Header, Results, made, read
 from benchmarks.solved.variants import VARIANTS
-from benchmarks.statistics import wilson
 from levelproof.configs.convert import plain
 from levelproof.configs.numbers import parse_count
 from levelproof.experts.config import check_budget
 from levelproof.levelgen.level import size_of
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.look.figures import Share
 
 PLOTTED = (
     "s-1M-alone",
@@ -119,6 +119,6 @@ def document(each: Results) -> dict:
     trained, solved = len(each.trained), len(each.solved())
     header = {name: x for name, x in asdict(each.header).items() if name != "config"}
     seconds = sum(row["core_seconds"] for row in each.rows.values())
-    share = {"share": solved / trained if trained else None, "interval": wilson(solved, trained)}
+    share = {"share": solved / trained if trained else None, "interval": Share(solved, trained).interval}
     counts = {"levels": len(each.rows), "with_expert": trained, "solved": solved, "core_seconds": seconds}
     return header | counts | share

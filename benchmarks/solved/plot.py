@@ -14,7 +14,7 @@ from benchmarks.plotting import save
 from benchmarks.report import Table
 from benchmarks.solved.results import Results, count, share
 from benchmarks.solved.tables import order
-from benchmarks.statistics import wilson
+from levelproof.pipeline.look.figures import Share
 
 MIN_STEPS = 4_000  # env steps where the axis begins
 POINTS = 120  # of a curve; more would be invisible
@@ -101,7 +101,7 @@ def draw(results: Sequence[Results], out: Path) -> None:
 def draw_curve(axes: Any, results: Results, name: str, colour: str) -> None:
     """Draw the unsolved share of a variant, with its interval and marks."""
     levels, (steps, remaining) = len(results.trained), curve(results)
-    low, high = zip(*(wilson(k, levels) for k in remaining), strict=True)
+    low, high = zip(*(Share(k, levels).interval for k in remaining), strict=True)
     axes.fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0)
     axes.plot(steps, [k / levels for k in remaining], color=colour, linewidth=1.6, label=name)
     marks = [mark for mark in MARKS if mark <= results.header.budget]

@@ -11,12 +11,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from benchmarks.oracle import alone
-from benchmarks.statistics import wilson
 from levelproof.configs.convert import flat, nested
 from levelproof.configs.schema import RENAMED
 from levelproof.experts.config import Rule
 from levelproof.experts.labels import TRAINED, Label
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.look.figures import Share
 
 FILE = Path(__file__).parents[1] / "results" / "solved.parquet"
 SIZES = ("s", "m", "l")  # in this order; custom sizes follow
@@ -167,7 +167,7 @@ def share(successes: int, trials: int) -> str:
     """Format a share with its 95% interval, such as `41.2% (37.0 to 45.5)`."""
     if not trials:
         return "-"
-    low, high = wilson(successes, trials)
+    low, high = Share(successes, trials).interval
     return f"{successes / trials:.1%} ({100 * low:.1f} to {100 * high:.1f})"
 
 

@@ -32,7 +32,9 @@ class Share(NamedTuple):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Wilson's 95% interval."""
+        """Wilson's 95% interval (1927); from 0 to 1 if the total is 0."""
+        if not self.total:
+            return 0.0, 1.0
         z2, p = DEVIATIONS**2 / self.total, self.hits / self.total
         middle, half = p + z2 / 2, DEVIATIONS * sqrt((p * (1 - p) + z2 / 4) / self.total)
         return max(0.0, (middle - half) / (1 + z2)), min(1.0, (middle + half) / (1 + z2))
@@ -44,7 +46,7 @@ class Share(NamedTuple):
 
     def __str__(self) -> str:
         low, high = self.interval
-        return f"{self.hits / self.total:.1%} ({low:.1%} to {high:.1%})"
+        return f"{self.hits / max(self.total, 1):.1%} ({low:.1%} to {high:.1%})"
 
 
 def draw_shares(shares: Mapping[str, Share], title: str, path: Path) -> None:

@@ -185,6 +185,7 @@ def test_share_interval_is_wilsons() -> None:
     assert np.allclose(Share(81, 263).interval, (0.2552, 0.3662), atol=1e-4)  # Newcombe, 1998
     assert Share(0, 10).interval == pytest.approx((0.0, 0.2775), abs=1e-4)
     assert Share(10, 10).interval == pytest.approx((0.7225, 1.0), abs=1e-4)
+    assert str(Share(0, 0)) == "0.0% (0.0% to 100.0%)"
 
 
 @pytest.mark.campaign
