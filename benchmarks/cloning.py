@@ -10,10 +10,10 @@ import itertools
 import json
 import os
 import re
-import resource
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -157,30 +157,27 @@ def command(*words: Any) -> str:
     return timed_command(*words)[0]
 
 
-def children_seconds() -> float:
-    """Return user and system seconds of all child processes that have ended."""
-    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return usage.ru_utime + usage.ru_stime
-
-
 def timed_command(*words: Any) -> tuple[str, float]:
     """Run a command as `command` does; return its output, and the CPU seconds of its process."""
+    return timed_process(f"levelproof {words[0]}", [sys.executable, "-m", "levelproof", *map(str, words)])
+
+
+def timed_process(name: str, arguments: Sequence[str], **options: Any) -> tuple[str, float]:
+    """Run a process with options of Popen; return its output, and the CPU seconds of it and its children.
+
+    Raises:
+        Failure: it fails; the message has its `name` and the last line of its errors.
+    """
     with tempfile.TemporaryFile("w+") as output, tempfile.TemporaryFile("w+") as errors:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "levelproof", *map(str, words)], stdout=output, stderr=errors, text=True
-        )
+        process = subprocess.Popen(arguments, stdout=output, stderr=errors, text=True, **options)
         _, status, used = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
         for file in (output, errors):
             file.seek(0)
         if process.returncode:
-            raise Failure(f"levelproof {words[0]} failed: {last_line(errors.read(), process.returncode)}")
+            lines = errors.read().strip().splitlines() or [f"exit code {process.returncode}"]
+            raise Failure(f"{name} failed: {lines[-1]}")
         return output.read(), used.ru_utime + used.ru_stime
-
-
-def last_line(errors: str, code: int) -> str:
-    """Return the last line that a failed process wrote to stderr, or its exit code if it wrote none."""
-    return (errors.strip().splitlines() or [f"exit code {code}"])[-1]
 
 
 def timed_split(out: Path, *words: Any) -> float:

@@ -16,14 +16,14 @@ from typing import Any
 
 import pyarrow.dataset as ds
 
-from benchmarks.cloning import children_seconds
+from benchmarks.cloning import timed_process
 from benchmarks.oracle import log
 from benchmarks.report import Report, Table
 from benchmarks.solved.results import share
 from benchmarks.statistics import flips
 from levelproof.experts.labels import Label
 from levelproof.experts.steps import Seconds
-from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.runtime import CACHE_VARIABLE, cache_folder, own_cores
 
 ROOT = Path(__file__).parents[1]
@@ -137,13 +137,9 @@ def generated(sources: Path, settings: Sequence[str]) -> dict[str, Any]:
             CACHE_VARIABLE: str(cache_folder() / "cost" / sources.name),
         }
         environment.pop("PYTHONDONTWRITEBYTECODE", None)  # Python would compile all sources in every run
-        before = children_seconds()
+        name = f"`levelproof {' '.join(command[3:])}` in {sources}"
         # Python looks for modules in the working directory first
-        done = subprocess.run(command, cwd=sources, env=environment, capture_output=True, text=True)
-        seconds = children_seconds() - before
-        if done.returncode:
-            words = " ".join(command[3:])
-            raise Failure(f"`levelproof {words}` in {sources} fails with {done.returncode}:\n{done.stderr[-2000:]}")
+        _, seconds = timed_process(name, command, cwd=sources, env=environment)
         manifests = [str(path) for path in Path(out).glob("*/*/manifest")]
         columns = ["level_id", "label", "seconds"]
         rows = [row for path in manifests for row in ds.dataset(path, format="parquet").to_table(columns).to_pylist()]

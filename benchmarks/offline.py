@@ -8,15 +8,14 @@ import json
 import os
 import shlex
 import shutil
-import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.cloning import SAMPLED, children_seconds, command, interval_text, kept, last_line, lines_of, slug
+from benchmarks.cloning import SAMPLED, command, interval_text, kept, lines_of, slug, timed_process
 from benchmarks.report import Report, Table
-from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.learn.evaluate import AGENT, SOLVED
 from levelproof.pipeline.store.files import write
 from levelproof.pipeline.store.job_note import sound_note
@@ -127,17 +126,8 @@ def learned(args: argparse.Namespace, data: str, way: str, seed: int) -> dict[st
 
 def trained(script: Path, datasets: Path, *words: Any) -> float:
     """Run TorchRL's training; return its CPU seconds. Raise Failure with the last line of its errors if it fails."""
-    before = children_seconds()
-    done = subprocess.run(
-        [sys.executable, script, *map(str, words)],
-        env={**os.environ, "MINARI_DATASETS_PATH": str(datasets.absolute())},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
-        raise Failure(f"{script} failed: {last_line(done.stderr, done.returncode)}")
-    return children_seconds() - before
+    environment = os.environ | {"MINARI_DATASETS_PATH": str(datasets.absolute())}
+    return timed_process(str(script), [sys.executable, str(script), *map(str, words)], env=environment)[1]
 
 
 def row_of(each: Mapping[str, Any]) -> list[str]:
