@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import jax
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,6 +11,7 @@ from levelproof.levelgen.level import MAX_PER_KIND, SIZES, Level, concatenate_le
 from levelproof.levelgen.sampling.sampler import sample_levels, sampler
 from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.physics.types import Size
+from tests.trees import assert_same
 
 
 @given(st.builds(Size, *[st.integers(0, MAX_PER_KIND)] * 4))
@@ -50,10 +50,6 @@ def test_size_of_refuses_an_impossible_size(name: str, sentence: str) -> None:
 @pytest.fixture(scope="module")
 def levels() -> Level:
     return sample_levels(np.arange(12), "s")
-
-
-def assert_same(left: Level, right: Level) -> None:
-    jax.tree.map(np.testing.assert_array_equal, left, right)
 
 
 def test_levels_have_a_length_and_are_chosen_by_index(levels: Level) -> None:

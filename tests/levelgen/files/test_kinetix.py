@@ -9,6 +9,7 @@ from levelproof.levelgen.files.kinetix import MANIFOLDS, level_from_kinetix, sta
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.physics.pairs import pairs_of
 from levelproof.physics.types import Model, Size, State
+from tests.trees import assert_same
 
 LANES = 3
 INTEGERS = {
@@ -46,16 +47,6 @@ def random_level(size: Size) -> Level:
     return random_instance(
         Level, size, rng, model=random_instance(Model, size, rng), state=random_instance(State, size, rng)
     )
-
-
-def assert_same(left: object, right: object) -> None:
-    for field in dataclasses.fields(left):
-        a, b = getattr(left, field.name), getattr(right, field.name)
-        if dataclasses.is_dataclass(a):
-            assert_same(a, b)
-        else:
-            np.testing.assert_array_equal(a, b, err_msg=field.name)
-            assert a.dtype == b.dtype, field.name
 
 
 @pytest.mark.parametrize("name", SIZES)

@@ -32,6 +32,7 @@ from levelproof.levelgen.sampling.sampler import Distribution, sample_levels
 from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.types import Params, Size
+from tests.trees import assert_same
 
 RULES = TaskParams(frame_skip=3, max_timesteps=100, dense_reward_scale=0.5, physics=Params(dt=0.01, motor_power=500.0))
 MAX_MEMORY = 250e6  # bytes, for the worst file of MAX_BYTES
@@ -61,11 +62,9 @@ def changed(path: str, value: object) -> Any:
     return altered
 
 
-def assert_same(ours: LevelFile, theirs: LevelFile) -> None:
+def assert_same_file(ours: LevelFile, theirs: LevelFile) -> None:
     assert ours.rules == theirs.rules
-    for (path, a), (_, b) in zip(*map(jax.tree_util.tree_leaves_with_path, (ours.level, theirs.level)), strict=True):
-        np.testing.assert_array_equal(a, b, err_msg=jax.tree_util.keystr(path))
-        assert a.dtype == b.dtype
+    assert_same(ours.level, theirs.level)
 
 
 # A size that other tests sample, so that their compiled program is reused; others in a campaign
@@ -79,7 +78,7 @@ def test_sampled_level_survives_a_round_trip(size: Size, tmp_path: Path) -> None
     for lane in range(8):
         file = LevelFile(one(levels(size), lane), RULES)
         write_level_file(file, tmp_path / "level.json")
-        assert_same(read_level_file(tmp_path / "level.json"), file)
+        assert_same_file(read_level_file(tmp_path / "level.json"), file)
     assert os.listdir(tmp_path) == ["level.json"]
 
 
@@ -328,7 +327,7 @@ def assert_sentence_or_level(text: bytes) -> None:
         return
     for leaf in jax.tree.leaves(file.level):
         assert np.isfinite(leaf).all()
-    assert_same(from_document(to_document(file)), file)
+    assert_same_file(from_document(to_document(file)), file)
 
 
 BITS = {"objects": b"{},", "fuller objects": b'{"":0},', "lists in lists": b"[" * 900 + b"]" * 900 + b","}

@@ -14,6 +14,7 @@ from levelproof.levelgen.sampling.sampler import Distribution, sample_levels
 from levelproof.levelgen.task.rules import TaskParams, TaskState, advance
 from levelproof.physics.types import Size
 from tests.levelgen.opened import Played, handmade_levels, open_in_reference
+from tests.trees import assert_same
 
 pytestmark = pytest.mark.campaign
 HANDMADE = {"s": 10, "m": 24, "l": 40}
@@ -56,12 +57,6 @@ def exported(size: Size, folder: Path, name: str, count: int = OURS) -> list[Pat
 def side_by_side(files: list[Path]) -> Level:
     levels = [read_level_file(path).level for path in files]
     return jax.tree.map(lambda *x: np.concatenate(x, -1), *levels)
-
-
-def assert_same(ours: Level, theirs: Level) -> None:
-    for (path, a), (_, b) in zip(*map(jax.tree_util.tree_leaves_with_path, (ours, theirs)), strict=True):
-        np.testing.assert_array_equal(a, b, err_msg=jax.tree_util.keystr(path))
-        assert a.dtype == b.dtype
 
 
 @pytest.mark.parametrize("size", SIZES)

@@ -27,6 +27,7 @@ from levelproof.levelgen.task.environment import (
 from levelproof.levelgen.task.observe.flat import symbolic_flat
 from levelproof.levelgen.task.spaces import Box, Dict, Discrete, MultiDiscrete
 from levelproof.physics.types import Size
+from tests.trees import assert_same, lanes_last
 
 LEVELS, STEPS = 24, 12
 
@@ -53,14 +54,6 @@ def actions() -> np.ndarray:
 
 def lane(tree, index: int):
     return jax.tree.map(lambda x: x[..., index], tree)
-
-
-def lanes_last(tree):
-    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), tree)
-
-
-def assert_same(left, right) -> None:
-    jax.tree.map(np.testing.assert_array_equal, left, right)
 
 
 def play(env: Environment, params: EnvParams, state: EnvState, keys: jax.Array, actions):

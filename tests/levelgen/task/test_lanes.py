@@ -14,6 +14,7 @@ from levelproof.levelgen.task.actions import CHOICES
 from levelproof.levelgen.task.environment import make, starts
 from levelproof.levelgen.task.lanes import Lanes
 from levelproof.levelgen.task.observe.kinds import ObservationType
+from tests.trees import assert_same, lanes_last
 
 COUNT, STEPS = 24, 12
 
@@ -21,10 +22,6 @@ COUNT, STEPS = 24, 12
 @pytest.fixture(scope="module")
 def levels() -> Level:
     return sample_levels(np.arange(COUNT), "s")
-
-
-def lanes_last(tree):
-    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), tree)
 
 
 @pytest.mark.slow
@@ -43,15 +40,15 @@ def test_lanes_step_as_mapped_environments_do(levels: Level) -> None:
         given = jax.tree.map(lambda x, chosen=chosen: x[chosen], fresh)
         expected, one, reward, done, expected_info = mapped(keys, one, actions[number], params, given)
         observed, state, played, *rest, info = step(table, played, state, actions[number].T, chosen)
-        jax.tree.map(np.testing.assert_array_equal, rest, [reward, done])
-        jax.tree.map(np.testing.assert_array_equal, state.now, lanes_last(one.now))
+        assert_same(rest, [reward, done])
+        assert_same(state.now, lanes_last(one.now))
         np.testing.assert_array_equal(state.level_index, one.level_index)
         np.testing.assert_allclose(observed, expected.T, rtol=1e-6)
         np.testing.assert_allclose(info.pop("final_observation"), expected_info.pop("final_observation").T, rtol=1e-6)
-        jax.tree.map(np.testing.assert_array_equal, info, expected_info)
+        assert_same(info, expected_info)
         ended += int(done.sum())
     assert ended > 2 * COUNT
-    jax.tree.map(np.testing.assert_array_equal, played, jax.jit(lanes.take)(table, state.level_index))
+    assert_same(played, jax.jit(lanes.take)(table, state.level_index))
 
 
 def test_lanes_take_numpy_levels_and_refuse_actions_of_another_type(levels: Level) -> None:

@@ -20,16 +20,9 @@ from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.store.fields import arrays_of, same_bits
 from levelproof.pipeline.store.manifest import read_manifest
+from tests.trees import assert_same, lanes_last
 
 STEPS = 48
-
-
-def lanes_last(tree):
-    return jax.tree.map(lambda x: np.moveaxis(np.asarray(x), 0, -1), tree)
-
-
-def assert_same(left, right) -> None:
-    jax.tree.map(np.testing.assert_array_equal, left, right)
 
 
 def test_manifest_has_the_levels_with_a_witness(split: Path, data: Dataset) -> None:

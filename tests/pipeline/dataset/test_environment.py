@@ -13,6 +13,7 @@ from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.seed import rows
 from tests.pipeline.command import ROOT
+from tests.trees import assert_same
 
 
 def test_make_uses_all_levels_and_the_rules_of_a_split(split: Path) -> None:
@@ -21,7 +22,7 @@ def test_make_uses_all_levels_and_the_rules_of_a_split(split: Path) -> None:
     ids = table["level_id"].to_numpy()
     np.testing.assert_array_equal(env.level_ids, ids)
     assert not table["shard"].is_valid().to_numpy().all(), "the split has no level without a witness: choose another"
-    jax.tree.map(np.testing.assert_array_equal, params.levels, levelproof.sample_levels(ids, "s"))
+    assert_same(params.levels, levelproof.sample_levels(ids, "s"))
     assert env.rules == levelproof.open(split).rules
 
 
@@ -41,7 +42,7 @@ def test_make_selects_levels_by_a_condition(split: Path) -> None:
     env, params = levelproof.make(split=str(split), where="shard IS NOT NULL", action_type="discrete")
     data = levelproof.open(split)
     np.testing.assert_array_equal(env.level_ids, data.manifest["level_id"])
-    jax.tree.map(np.testing.assert_array_equal, params.levels, data.levels(np.arange(len(data))))
+    assert_same(params.levels, data.levels(np.arange(len(data))))
     _, state = jax.eval_shape(env.reset, jax.random.key(0), params)
     assert state.level_index.shape == ()
 

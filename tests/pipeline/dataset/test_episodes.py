@@ -14,6 +14,7 @@ from levelproof.pipeline.dataset.episodes import EpisodeBatch
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.exchange.seed import export_seed
 from tests.pipeline.made import honest_split
+from tests.trees import assert_same
 
 CONTENT = ["level", "record"]
 
@@ -30,12 +31,6 @@ def seeds(honest: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, where in ("a", "level_id < 8"), ("b", "level_id >= 8"):
         export_seed(honest, where, folder / f"{name}.parquet")
     return folder
-
-
-def assert_equal(ours: EpisodeBatch, theirs: EpisodeBatch) -> None:
-    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(ours), jax.tree.leaves(theirs), strict=True):
-        assert (a.dtype, a.shape) == (b.dtype, b.shape), path
-        np.testing.assert_array_equal(a, b, str(path))
 
 
 def test_episodes_are_the_beginnings_of_records(data: Dataset) -> None:
@@ -61,7 +56,7 @@ def test_episodes_of_seeds_are_those_of_their_split(honest: Path, seeds: Path, o
     mine, split = (data.episodes(indices, fields, observation) for data in (ours, theirs))
     live = split.action * split.action_mask  # seeds have no actions without an effect
     assert mine.action.tolist() == live.tolist()
-    assert_equal(mine, jax.tree.map(np.asarray, split.__class__(**{**vars(split), "action": mine.action})))
+    assert_same(mine, jax.tree.map(np.asarray, split.__class__(**{**vars(split), "action": mine.action})))
 
 
 def test_episodes_have_the_same_bits_however_many_are_played_together(
@@ -72,8 +67,8 @@ def test_episodes_have_the_same_bits_however_many_are_played_together(
     few = data.episodes(indices, fields, None)
     for name, value in ("FEW", 0), ("MANY", 1):
         monkeypatch.setattr(episode, name, value)
-    assert_equal(data.episodes(indices, fields, None), few)
-    assert_equal(data.episodes(indices, fields, None).parts(1)[3], data.episodes([3], fields, None))
+    assert_same(data.episodes(indices, fields, None), few)
+    assert_same(data.episodes(indices, fields, None).parts(1)[3], data.episodes([3], fields, None))
 
 
 def test_episode_batches_yield_each_episode_once(seeds: Path) -> None:
@@ -83,7 +78,7 @@ def test_episode_batches_yield_each_episode_once(seeds: Path) -> None:
     ids = np.concatenate([batch.level_id[np.unique(batch.episode[batch.mask])] for batch in batches]).tolist()
     assert sorted(ids) == data.manifest["level_id"].to_pylist() != ids
     for batch in batches:
-        assert_equal(batch, batch.__class__(**{**vars(data.episodes(indices_of(data, batch), (), None)),
+        assert_same(batch, batch.__class__(**{**vars(data.episodes(indices_of(data, batch), (), None)),
                                                "mask": batch.mask}))  # fmt: skip
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from levelproof.experts.witness.witness import Record, replay, succeeds
 from levelproof.levelgen.files.level_file import MAX_BYTES, LevelFile, read_level_file, write_level_file
-from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.cli.main import main
@@ -24,6 +24,7 @@ from levelproof.pipeline.store.manifest import require_manifest
 from levelproof.pipeline.store.shard import Shard
 from tests.levelgen.opened import open_in_reference
 from tests.pipeline.made import PLAYED, made_job
+from tests.trees import assert_same
 
 
 @pytest.fixture(scope="module")
@@ -36,11 +37,6 @@ def file(split, tmp_path_factory) -> Path:
 
 def level_with(split: Path, label: str) -> dict[str, Any]:
     return next(row for row in require_manifest(split).table.to_pylist() if row["label"] == label)
-
-
-def assert_same(ours: Level, theirs: Level) -> None:
-    for a, b in zip(*map(jax.tree.leaves, (ours, theirs)), strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 @pytest.mark.parametrize("label", ["solved", "unsolved"])
