@@ -26,7 +26,7 @@ from benchmarks.report import Report
 from levelproof.levelgen.batching import blocks
 from levelproof.physics.types import FIXED_POLYGONS, Params
 from levelproof.pipeline.errors import Exit
-from tests.golden.load import HERE, load
+from tests.golden.load import golden
 from tests.pace import patience
 
 ROOT = Path(__file__).parent.parent.parent
@@ -35,9 +35,9 @@ ROOT = Path(__file__).parent.parent.parent
 @pytest.fixture(scope="module")
 def pool() -> Pool:
     """A block of golden states of size s."""
-    golden = load(HERE / "s.npz")
-    level, action = lanes_of((golden.level, golden.action), np.arange(BLOCK))
-    return Pool(level, action, golden.scene[:BLOCK], [f"golden {lane}" for lane in range(BLOCK)])
+    sample = golden("s")
+    level, action = lanes_of((sample.level, sample.action), np.arange(BLOCK))
+    return Pool(level, action, sample.scene[:BLOCK], [f"golden {lane}" for lane in range(BLOCK)])
 
 
 @pytest.fixture(scope="module")
@@ -48,13 +48,13 @@ def stepped(pool) -> Stepped:
 @pytest.fixture(scope="module")
 def reference_after(pool, stepped) -> Stepped:
     """The reference's results; its geometry is not stored, so ours is used."""
-    return stepped._replace(state=lanes_of(load(HERE / "s.npz").after, np.arange(BLOCK)))
+    return stepped._replace(state=lanes_of(golden("s").after, np.arange(BLOCK)))
 
 
 @pytest.fixture(scope="module")
 def large():
     """Levels of size l, at rest at their starts."""
-    return load(HERE / "l.npz").level
+    return golden("l").level
 
 
 def altered(after: Stepped, **state) -> Stepped:

@@ -2,8 +2,10 @@
 
 import json
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -39,15 +41,16 @@ class Golden:
     about: dict  # size, seed, versions, counts of what the states show
 
 
-def load(path: Path | str) -> Golden:
-    """The golden states of a file; `HERE / "s.npz"` are the committed ones of size s."""
-    with np.load(path) as file:
+@cache
+def golden(size: str) -> Golden:
+    """The golden states of a size, read once per process; arrays are read-only."""
+    with np.load(HERE / f"{size}.npz") as file:
         fields = {name: _widen(file[name]) for name in file.files}
     about = json.loads(str(fields.pop("about")))
     before, after, env_after = (_part(fields, prefix) for prefix in ("before/", "after/", "env_after/"))
     level, joints = level_from_kinetix(before), before["joint/active"].shape[1]
     last_axis = ("action", "action_mask", "reward", "done", "goal", "obs", "next_obs")
-    return Golden(
+    states = Golden(
         level=level,
         state=level.state,
         timestep=before["timestep"],
@@ -62,6 +65,10 @@ def load(path: Path | str) -> Golden:
         about=about,
         **{name: _last(fields[name]) for name in last_axis},
     )
+    for leaf in jax.tree.leaves(vars(states)):
+        if isinstance(leaf, np.ndarray):
+            leaf.flags.writeable = False
+    return states
 
 
 def _part(fields: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from levelproof.levelgen.level import Level
-from tests.golden.load import HERE, load
+from tests.golden.load import HERE, golden
 
 DIGITS = 8
 
@@ -27,16 +27,16 @@ def load_seen(size: str) -> Seen:
     with np.load(HERE / f"seen_{size}.npz") as file:
         fields = {name: np.moveaxis(file[name], 0, -1) for name in file.files if name != "about"}
     lanes = fields["image"].shape[-1]
-    return Seen(jax.tree.map(lambda x: x[..., :lanes], load(HERE / f"{size}.npz").level), fields)
+    return Seen(jax.tree.map(lambda x: x[..., :lanes], golden(size).level), fields)
 
 
 def assert_seen(fields: dict[str, np.ndarray], name: str, ours: np.ndarray) -> None:
     """Numbers agree in the states kept in full, and their weighted sums in all; other kinds agree everywhere."""
-    golden = fields[name]
+    expected = fields[name]
     if ours.dtype.kind != "f":
-        np.testing.assert_array_equal(ours, golden)
+        np.testing.assert_array_equal(ours, expected)
         return
-    np.testing.assert_allclose(ours[..., : golden.shape[-1]], golden, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(ours[..., : expected.shape[-1]], expected, rtol=1e-5, atol=1e-5)
     rows = ours.reshape(-1, ours.shape[-1]).astype(np.float64)
     weights = np.random.default_rng(len(rows)).standard_normal((len(rows), DIGITS))
     scale = np.abs(weights).T @ np.abs(rows) + 1

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from levelproof.pipeline.runtime import prepare_jax
-from tests.golden.load import HERE, load
+from tests.golden.load import golden
 from tests.physics.worlds import PARAMS, scattered
 
 NO_CONTRACTION = "--xla_cpu_max_isa=AVX"
@@ -29,8 +29,8 @@ def worlds(name: str) -> Any:
     from levelproof.physics.types import Size
 
     if name in "sml":
-        golden = load(HERE / f"{name}.npz")
-        return Inputs(golden.level.model, golden.state, golden.motor, golden.thrust)
+        sample = golden(name)
+        return Inputs(sample.level.model, sample.state, sample.motor, sample.thrust)
     return Inputs(*scattered(Size(*map(int, name.split(","))), lanes=256))
 
 

@@ -17,7 +17,7 @@ from levelproof.physics.codegen.buffers import LANES
 from levelproof.physics.step import as_annotated, kernel_of, step
 from levelproof.physics.types import DEFAULT_PARAMS, State
 from tests import arm
-from tests.golden.load import HERE, load
+from tests.golden.load import golden
 from tests.processors import PROCESSORS, become, run_on
 
 STEPS = 8
@@ -32,8 +32,8 @@ def digest(size: str) -> str:
 
 def digest_after(size: str, advance: Callable[[Inputs], State]) -> str:
     """Hash the states after STEPS calls of `advance` on the golden ones."""
-    golden = load(HERE / f"{size}.npz")
-    inputs = Inputs(golden.level.model, golden.state, golden.motor, golden.thrust)
+    sample = golden(size)
+    inputs = Inputs(sample.level.model, sample.state, sample.motor, sample.thrust)
     for _ in range(STEPS):
         inputs = inputs._replace(before=advance(inputs))
     total = hashlib.sha256()

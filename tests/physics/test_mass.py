@@ -13,7 +13,7 @@ from levelproof.physics.mass import (
     polygon_inertia,
 )
 from levelproof.physics.types import FIXED_POLYGONS
-from tests.golden.load import HERE, load
+from tests.golden.load import golden
 
 sides = st.floats(0.0625, 1.0, width=32)
 corner = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)], np.float32)
@@ -30,7 +30,7 @@ def one(vertices: list | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("size", ["s", "m", "l"])
 def test_masses_equal_the_references(size: str) -> None:
     """For rectangles, triangles and circles of sampled levels."""
-    level = load(HERE / f"{size}.npz").level
+    level = golden(size).level
     model, polygons = level.model, level.size.polygons
     density = np.asarray(level.density)
     area = [polygon_area(model.vertices, model.n_vertices), circle_area(model.radius)]

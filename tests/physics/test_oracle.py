@@ -10,7 +10,7 @@ import pytest
 from levelproof.physics.pairs import pairs_of
 from levelproof.physics.step import step
 from levelproof.physics.types import Params
-from tests.golden.load import HERE, Golden, load
+from tests.golden.load import HERE, Golden, golden
 
 MOTION = ("position", "rotation", "velocity", "angular_velocity")
 SIZES = ("s", "m", "l")
@@ -27,11 +27,6 @@ SHOWN = {
     "firing thruster": 200,
     "triangle": 50,
 }
-
-
-@functools.cache
-def golden(size: str) -> Golden:
-    return load(HERE / f"{size}.npz")
 
 
 @functools.cache

@@ -9,7 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from levelproof.physics.step import step
-from tests.golden.load import HERE, load
+from tests.golden.load import golden
 from tests.physics import mirror
 from tests.physics.test_oracle import errors
 from tests.physics.test_step import host, momentum, play
@@ -105,11 +105,10 @@ class TestRest:
         np.testing.assert_allclose(after.rotation[BOX, 0], side, atol=0.02)
 
 
-@functools.cache
-def golden(size: str):
+def world_of(size: str):
     """Return the golden worlds of a size with their controls."""
-    golden = load(HERE / f"{size}.npz")
-    return golden.level.model, golden.state, golden.motor, golden.thrust
+    sample = golden(size)
+    return sample.level.model, sample.state, sample.motor, sample.thrust
 
 
 class TestMirror:
@@ -128,20 +127,20 @@ class TestMirror:
     @staticmethod
     @functools.cache
     def both(size: str, steps: int):
-        world = golden(size)
+        world = world_of(size)
         here, contacts = play(*world, steps)
         there, contacts_there = play(*mirror.of_world(*world), steps)
         return here, contacts, mirror.of_state(there), mirror.of_manifold(contacts_there)
 
     def off(self, size: str, steps: int) -> np.ndarray:
         """Return the largest difference of each symmetric lane."""
-        model, _, motor, _ = golden(size)
+        model, _, motor, _ = world_of(size)
         here, _, there, _ = self.both(size, steps)
         return errors(here, there)[~self.asymmetric(model, motor)]
 
     @pytest.mark.parametrize("size", SIZES)
     def test_mirroring_twice_restores_the_world(self, size: str) -> None:
-        world = golden(size)
+        world = world_of(size)
         for a, b in zip(
             jax.tree.leaves(world), jax.tree.leaves(mirror.of_world(*mirror.of_world(*world))), strict=True
         ):
@@ -166,7 +165,7 @@ class TestMirror:
         assert turned.max() < 0.1
 
     def test_mirrored_step_without_contacts_and_thrusters_is_exact(self) -> None:
-        model, _, motor, thrust = golden("s")
+        model, _, motor, thrust = world_of("s")
         here, _, there, _ = self.both("s", 1)
         fires = (model.thruster_active & (thrust != 0)).any(0)
         plain = ~here.contact_active.any(0) & ~fires & ~self.asymmetric(model, motor)
@@ -186,7 +185,7 @@ class TestPrecision:
     @pytest.mark.slow
     @pytest.mark.parametrize("size", ["s", *(pytest.param(size, marks=pytest.mark.campaign) for size in "ml")])
     def test_single_precision_step_is_close_to_double(self, size: str) -> None:
-        world = golden(size)
+        world = world_of(size)
         single, _ = play(*world)
         with jax.enable_x64(True):
             wide = jax.tree.map(

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from levelproof.physics.pairs import table_of
 from levelproof.physics.step import step
 from levelproof.physics.types import Params, Size
-from tests.golden.load import HERE, load
+from tests.golden.load import golden
 from tests.physics.worlds import (
     BALL,
     BOX,
@@ -223,7 +223,7 @@ class TestLanes:
     @classmethod
     def after(cls, lanes, steps: int = STEPS, size: str = "s"):
         """Step the golden states of `lanes`, as a batch of their own."""
-        sample = load(HERE / f"{size}.npz")
+        sample = golden(size)
         take = lambda tree: jax.tree.map(lambda x: np.ascontiguousarray(x[..., lanes]), tree)
         return play(
             take(sample.level.model), take(sample.state), sample.motor[:, lanes], sample.thrust[:, lanes], steps
@@ -263,7 +263,7 @@ class TestLanes:
     @pytest.mark.parametrize("size", ["s", *(pytest.param(size, marks=pytest.mark.campaign) for size in "ml")])
     def test_returning_contacts_changes_no_bits(self, size: str) -> None:
         """A step that returns no contacts leads to the same state."""
-        sample = load(HERE / f"{size}.npz")
+        sample = golden(size)
         given = sample.level.model, sample.state, sample.motor, sample.thrust
         self.same_bits(host(jax.jit(lambda *given: step(*given, with_contacts=False)[0])(*given)), play(*given)[0])
 

@@ -11,14 +11,14 @@ from levelproof.levelgen.level import WORLD_SIDE, Role
 from levelproof.levelgen.pictures.raster import draw, sheet, write_gif, write_png
 from levelproof.levelgen.pictures.style import BINDING_COLOUR, BORDER, HEADER, ROLE_COLOUR
 from levelproof.levelgen.pictures.words import Caption, obeyed_entries
-from tests.golden.load import HERE, load
+from tests.golden.load import golden
 
 OFF = np.zeros(6, np.int32)
 
 
 @pytest.fixture(scope="module")
-def golden():
-    return load(HERE / "m.npz")
+def sample():
+    return golden("m")
 
 
 def shows(picture: Image.Image, colour: tuple[int, int, int]) -> bool:
@@ -34,37 +34,37 @@ def lane_with(flag: np.ndarray) -> int:
     return int(np.flatnonzero(flag.any(0))[0])
 
 
-def test_picture_shows_bodies_in_their_role_colours(golden) -> None:
-    model = golden.level.model
+def test_picture_shows_bodies_in_their_role_colours(sample) -> None:
+    model = sample.level.model
     movable = model.active & (model.inverse_mass != 0)
     for role in Role:
-        lanes = np.flatnonzero((movable & (golden.level.role == role) & (golden.state.position[:, 1] > 0.3)).any(0))[:5]
-        shown = [shows(draw(golden.level, golden.state, lane), ROLE_COLOUR[role]) for lane in lanes]
+        lanes = np.flatnonzero((movable & (sample.level.role == role) & (sample.state.position[:, 1] > 0.3)).any(0))[:5]
+        shown = [shows(draw(sample.level, sample.state, lane), ROLE_COLOUR[role]) for lane in lanes]
         assert sum(shown) >= 4, role  # a body may hide behind another
 
 
-def test_pictures_of_a_level_have_one_size(golden) -> None:
-    plain = draw(golden.level, golden.state, 0)
+def test_pictures_of_a_level_have_one_size(sample) -> None:
+    plain = draw(sample.level, sample.state, 0)
     assert plain.size[0] == 480
-    assert draw(golden.level, golden.state, 1).size == plain.size
-    assert draw(golden.level, golden.state, 1, action=OFF).size[1] > plain.size[1]
-    assert draw(golden.level, golden.state, 0, pixels=240).size[0] == 240
+    assert draw(sample.level, sample.state, 1).size == plain.size
+    assert draw(sample.level, sample.state, 1, action=OFF).size[1] > plain.size[1]
+    assert draw(sample.level, sample.state, 0, pixels=240).size[0] == 240
 
 
-def test_picture_hatches_immovable_bodies(golden) -> None:
+def test_picture_hatches_immovable_bodies(sample) -> None:
     """The same circle, fixed and free: the fixed one has more edge colour than fill."""
-    model = golden.level.model
-    lane = lane_with(model.active & (model.inverse_mass != 0) & (golden.level.role == Role.PLAIN))
+    model = sample.level.model
+    lane = lane_with(model.active & (model.inverse_mass != 0) & (sample.level.role == Role.PLAIN))
     inverse_mass = model.inverse_mass.copy()
     inverse_mass[:, lane] = 0
-    held = dataclasses.replace(golden.level, model=dataclasses.replace(model, inverse_mass=inverse_mass))
-    assert changed(draw(golden.level, golden.state, lane), draw(held, golden.state, lane)) > 100
-    assert not shows(draw(held, golden.state, lane), ROLE_COLOUR[Role.PLAIN])
+    held = dataclasses.replace(sample.level, model=dataclasses.replace(model, inverse_mass=inverse_mass))
+    assert changed(draw(sample.level, sample.state, lane), draw(held, sample.state, lane)) > 100
+    assert not shows(draw(held, sample.state, lane), ROLE_COLOUR[Role.PLAIN])
 
 
 @pytest.mark.parametrize("actuator", ["motor", "thruster"])
-def test_picture_shows_actuators_in_use(golden, actuator: str) -> None:
-    level, model = golden.level, golden.level.model
+def test_picture_shows_actuators_in_use(sample, actuator: str) -> None:
+    level, model = sample.level, sample.level.model
     if actuator == "motor":
         acts = model.joint_active & model.motor_on & ~model.joint_fixed & ~level.motor_auto
     else:
@@ -73,32 +73,32 @@ def test_picture_shows_actuators_in_use(golden, actuator: str) -> None:
     used = OFF.copy()
     entry = int(level.motor_binding[0, lane]) if actuator == "motor" else 4 + int(level.thruster_binding[0, lane])
     used[entry] = 1
-    off, on = draw(level, golden.state, lane, action=OFF), draw(level, golden.state, lane, action=used)
+    off, on = draw(level, sample.state, lane, action=OFF), draw(level, sample.state, lane, action=used)
     world = (0, 40, 480, off.size[1] - 30)  # without caption and keys
     assert changed(off.crop(world), on.crop(world)) > 20
     assert shows(on, BINDING_COLOUR[entry])
 
 
-def test_arrow_follows_the_sign_of_a_motors_speed(golden) -> None:
+def test_arrow_follows_the_sign_of_a_motors_speed(sample) -> None:
     """As in a level file, or a mirrored motor that runs by itself."""
-    level, model = golden.level, golden.level.model
+    level, model = sample.level, sample.level.model
     lane = lane_with((model.joint_active & model.motor_on & ~model.joint_fixed & ~level.motor_auto)[:1])
     backwards = dataclasses.replace(level, model=dataclasses.replace(model, motor_speed=-model.motor_speed))
     entry, choices = int(level.motor_binding[0, lane]), []
     for choice in (1, 2):
         choices.append(OFF.copy())
         choices[-1][entry] = choice
-    forward, back = (draw(level, golden.state, lane, action=action) for action in choices)
+    forward, back = (draw(level, sample.state, lane, action=action) for action in choices)
     assert changed(forward, back) > 20
     world = (0, 40, 480, forward.size[1] - 30)  # without caption and keys
     for action, expected in zip(choices, (back, forward), strict=True):
-        drawn = draw(backwards, golden.state, lane, action=action)
+        drawn = draw(backwards, sample.state, lane, action=action)
         assert changed(drawn.crop(world), expected.crop(world)) == 0
 
 
-def test_flame_points_opposite_to_the_force(golden) -> None:
+def test_flame_points_opposite_to_the_force(sample) -> None:
     """The engine pushes a body along its thruster; the flame is on the other side."""
-    model, state = golden.level.model, golden.state
+    model, state = sample.level.model, sample.state
     lane = lane_with(model.thruster_active[:1])
     body = int(model.thruster_body[0, lane])
     turn = state.rotation[body, lane] + np.array([0, model.thruster_rotation[0, lane]])
@@ -111,19 +111,19 @@ def test_flame_points_opposite_to_the_force(golden) -> None:
     )
     push = np.array([np.cos(turn.sum()), np.sin(turn.sum())])
     used = OFF.copy()
-    used[4 + int(golden.level.thruster_binding[0, lane])] = 1
-    off, on = (np.asarray(draw(golden.level, state, lane, action=x)).astype(int) for x in (OFF, used))
+    used[4 + int(sample.level.thruster_binding[0, lane])] = 1
+    off, on = (np.asarray(draw(sample.level, state, lane, action=x)).astype(int) for x in (OFF, used))
     rows, columns = np.nonzero((off != on).any(-1)[40:-30])
     scale = 480 / (WORLD_SIDE + 2 * BORDER)
     middle = np.array([columns.mean() / scale - BORDER, WORLD_SIDE + BORDER + HEADER - (rows.mean() + 40) / scale])
     assert np.dot(middle - place, push) < -0.1
 
 
-def test_obeyed_entries_are_those_of_the_action_mask_but_for_motors_without_a_player(golden) -> None:
+def test_obeyed_entries_are_those_of_the_action_mask_but_for_motors_without_a_player(sample) -> None:
     seen = set[int]()
     for lane in range(64):
-        one = jax.tree.map(lambda x, lane=lane: x[..., lane], golden.level)
-        obeyed, mask = obeyed_entries(one), np.flatnonzero(golden.action_mask[:, lane])
+        one = jax.tree.map(lambda x, lane=lane: x[..., lane], sample.level)
+        obeyed, mask = obeyed_entries(one), np.flatnonzero(sample.action_mask[:, lane])
         turns = one.model.joint_active & ~one.model.joint_fixed
         if (one.model.motor_on & ~one.motor_auto)[turns].all():
             assert obeyed == [*mask]
@@ -133,17 +133,17 @@ def test_obeyed_entries_are_those_of_the_action_mask_but_for_motors_without_a_pl
     assert seen == {*range(len(OFF))}
 
 
-def test_picture_shows_its_caption(golden) -> None:
-    bare = draw(golden.level, golden.state, 0)
-    captioned = draw(golden.level, golden.state, 0, caption=Caption("level 7 · size m", "1.2 s", "goal reached"))
-    bad = draw(golden.level, golden.state, 0, caption=Caption("level 7 · size m", "1.2 s", "touched red", good=False))
+def test_picture_shows_its_caption(sample) -> None:
+    bare = draw(sample.level, sample.state, 0)
+    captioned = draw(sample.level, sample.state, 0, caption=Caption("level 7 · size m", "1.2 s", "goal reached"))
+    bad = draw(sample.level, sample.state, 0, caption=Caption("level 7 · size m", "1.2 s", "touched red", good=False))
     assert changed(bare, captioned) > 500
     assert shows(captioned.crop((0, 0, 480, 34)), ROLE_COLOUR[Role.GREEN])
     assert shows(bad.crop((0, 0, 480, 34)), ROLE_COLOUR[Role.RED])
 
 
-def test_gif_shows_each_picture_for_its_time(golden, tmp_path) -> None:
-    pictures = [draw(golden.level, golden.state, lane, pixels=160) for lane in range(5)]
+def test_gif_shows_each_picture_for_its_time(sample, tmp_path) -> None:
+    pictures = [draw(sample.level, sample.state, lane, pixels=160) for lane in range(5)]
     write_gif(pictures, tmp_path / "film.gif", [0.07] * 4 + [1.0])
     with Image.open(tmp_path / "film.gif") as film:
         assert film.n_frames == 5

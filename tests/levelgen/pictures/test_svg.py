@@ -18,17 +18,12 @@ from levelproof.levelgen.pictures.scene import scene_of
 from levelproof.levelgen.pictures.shapes import Scene
 from levelproof.levelgen.pictures.svg import svg_of
 from levelproof.levelgen.pictures.words import Caption
-from tests.golden.load import HERE, load
+from tests.golden.load import golden
 from tests.pace import patience
 
 SVG = "{http://www.w3.org/2000/svg}"
 WORLD = slice(40, 500)  # rows without text, whose font may differ between machines
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
-
-
-@pytest.fixture(scope="module")
-def golden():
-    return {size: load(HERE / f"{size}.npz") for size in "sml"}
 
 
 def scene(sample, lane: int, **caption) -> Scene:
@@ -99,9 +94,9 @@ def _value(element: ET.Element, second: float) -> str:
     return ",".join(str(np.interp(share, times, column)) for column in numbers.T)
 
 
-def test_comparison_notices_a_moved_or_missing_part(golden) -> None:
+def test_comparison_notices_a_moved_or_missing_part() -> None:
     """One part is six pixels away from its position, or missing."""
-    still = scene(golden["l"], 3)
+    still = scene(golden("l"), 3)
     body = max(i for i, part in enumerate(still.parts) if part.angle)
     part = still.parts[body]
     for other in (replace(part, position=(part.position[0] + 0.06, part.position[1])), replace(part, shapes="")):
@@ -111,35 +106,35 @@ def test_comparison_notices_a_moved_or_missing_part(golden) -> None:
 
 
 @pytest.mark.parametrize("size", "sml")
-def test_film_shows_each_scene_at_its_time(golden, size: str) -> None:
-    scenes, seconds = film(golden[size])
+def test_film_shows_each_scene_at_its_time(size: str) -> None:
+    scenes, seconds = film(golden(size))
     svg = svg_of(scenes, seconds)
     for number, start in enumerate(np.cumsum([0.0, *seconds[:-1]])):
         assert_alike(picture(at(svg, float(start))), pixels(scenes[number]))
     assert_alike(picture(at(svg, sum(seconds) - 0.01)), pixels(scenes[-1]))  # the last scene is held
 
 
-def test_film_begins_with_its_first_scene(golden) -> None:
+def test_film_begins_with_its_first_scene() -> None:
     """For programs that do not play films."""
-    scenes, seconds = film(golden["m"])
+    scenes, seconds = film(golden("m"))
     assert_alike(picture(svg_of(scenes, seconds)), pixels(scenes[0]))
 
 
-def test_still_parts_are_not_animated(golden) -> None:
-    still = scene(golden["l"], 0)
+def test_still_parts_are_not_animated() -> None:
+    still = scene(golden("l"), 0)
     svg = svg_of([still] * 10, [0.1] * 10)
     assert "animate" not in svg
     assert svg == svg_of([still], [0.1])
 
 
-def test_film_file_is_small(golden) -> None:
-    scenes, seconds = film(golden["l"], 64)
+def test_film_file_is_small() -> None:
+    scenes, seconds = film(golden("l"), 64)
     assert len(svg_of(scenes, seconds)) < 150_000
 
 
 @pytest.mark.parametrize("title", ["<script>alert(1)</script>", 'a & b "quoted"', "\x00\x1b[31m\udcff", "x" * 500])
-def test_svg_escapes_any_title(golden, title: str) -> None:
-    root = ET.fromstring(svg_of([scene(golden["s"], 0, title=title)], [1.0]).encode())
+def test_svg_escapes_any_title(title: str) -> None:
+    root = ET.fromstring(svg_of([scene(golden("s"), 0, title=title)], [1.0]).encode())
     assert not list(root.iter(f"{SVG}script"))
     words = [element.text or "" for element in root.iter(f"{SVG}text")]
     assert words[0][:3] == title[:3] or not title.isprintable()
@@ -148,8 +143,8 @@ def test_svg_escapes_any_title(golden, title: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not BROWSER, reason="needs the program chromium or google-chrome")
-def test_browser_plays_a_film(golden, tmp_path) -> None:
-    scenes, seconds = film(golden["l"])
+def test_browser_plays_a_film(tmp_path) -> None:
+    scenes, seconds = film(golden("l"))
     svg = svg_of(scenes, seconds)
     for number, start in enumerate(np.cumsum([0.0, *seconds[:-1]])):
         assert_alike(photograph(svg, float(start) + 1e-4, tmp_path), pixels(scenes[number]))

@@ -24,7 +24,7 @@ from levelproof.physics.step import step
 from levelproof.physics.trigonometry import cos_sin
 from levelproof.physics.types import FIXED_POLYGONS, Size
 from levelproof.physics.vector import Vec
-from tests.golden.load import HERE, load
+from tests.golden.load import HERE, golden
 
 COUNTS = {"s": 1024, "m": 1024, "l": 512}  # levels
 MANY = {"s": 4096, "m": 4096, "l": 2048}  # in a campaign
@@ -174,13 +174,13 @@ def test_unused_rows_are_blank(level: Level) -> None:
 
 @pytest.mark.parametrize("size", SIZES)
 def test_scenery_and_collision_matrix_equal_the_references(size: str) -> None:
-    golden = load(HERE / f"{size}.npz").level
-    ours, lanes = empty_level(SIZES[size], golden.role.shape[-1]), np.s_[:FIXED_POLYGONS]
-    np.testing.assert_array_equal(jax.jit(collision_matrix)(golden.model), golden.model.collides)
+    theirs = golden(size).level
+    ours, lanes = empty_level(SIZES[size], theirs.role.shape[-1]), np.s_[:FIXED_POLYGONS]
+    np.testing.assert_array_equal(jax.jit(collision_matrix)(theirs.model), theirs.model.collides)
     for name in ("vertices", "inverse_mass", "collision_mode", "active", "n_vertices"):
-        np.testing.assert_array_equal(getattr(ours.model, name)[lanes], getattr(golden.model, name)[lanes])
+        np.testing.assert_array_equal(getattr(ours.model, name)[lanes], getattr(theirs.model, name)[lanes])
     for name in ("position", "rotation"):
-        np.testing.assert_array_equal(getattr(ours.state, name)[lanes], getattr(golden.state, name)[lanes])
+        np.testing.assert_array_equal(getattr(ours.state, name)[lanes], getattr(theirs.state, name)[lanes])
     assert np.abs(np.asarray(ours.model.gravity) - [[0], [-9.81]]).max() < 1e-6
 
 

@@ -24,14 +24,9 @@ from levelproof.levelgen.task.rules import (
 )
 from levelproof.physics.pairs import pairs_of
 from levelproof.physics.types import Manifold
-from tests.golden.load import HERE, Golden, load
+from tests.golden.load import Golden, golden
 
 OFF = 0  # every entry of an action
-
-
-@functools.cache
-def golden(size: str) -> Golden:
-    return load(HERE / f"{size}.npz")
 
 
 @functools.cache
