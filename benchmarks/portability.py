@@ -26,7 +26,7 @@ from levelproof.experts.verdict.judge import Witness, candidates_of
 from levelproof.experts.verdict.portability import survival
 from levelproof.levelgen.batching import take
 from levelproof.levelgen.files.level_file import LevelFile, write_level_file
-from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.level import SIZES, Level, concatenate_levels
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.errors import UserError
@@ -85,7 +85,7 @@ def measured(python: Path, size: str, count: int, first: int) -> Played:
         for solved_level in solved(pool, ids[start : start + UNIT], size)
     ]
     oracle.log(f"{size}: {len(solved_levels)} of {count} levels are solved.")
-    levels = jax.tree.map(lambda *x: np.concatenate(x, -1), *(solved_level.level for solved_level in solved_levels))
+    levels = concatenate_levels([solved_level.level for solved_level in solved_levels])
     level_ids = np.array([solved_level.level_id for solved_level in solved_levels], np.int32)
     kinds = list(zip(*(solved_level.witnesses for solved_level in solved_levels), strict=True))
     shares = [survival(levels, level_ids, kind, ExpertConfig().replays, DEFAULT_RULES) for kind in kinds]

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from levelproof.configs.clone import CloneConfig
 from levelproof.experts.imitation import Transitions
 from levelproof.experts.networks.over_levels import NetworkConfig
-from levelproof.levelgen.level import Level
+from levelproof.levelgen.level import Level, concatenate_levels
 from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.dataset.order import EpochOrder
 from levelproof.pipeline.learn.mirrored import Witnesses, mirrored
@@ -94,7 +94,7 @@ def read_pool(
 
 def _joined(parts: Sequence[LevelPool]) -> LevelPool:
     steps = np.concatenate([part.steps for part in parts])
-    level = jax.tree.map(lambda *xs: np.concatenate(xs, -1), *(part.level for part in parts))
+    level = concatenate_levels([part.level for part in parts])
     motion, action = (np.concatenate([getattr(part, name) for part in parts]) for name in ("motion", "action"))
     return LevelPool(level, np.cumsum(steps) - steps, steps, motion, action)
 

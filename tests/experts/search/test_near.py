@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from levelproof.experts.search.near import FAR, gap, goals_of
-from levelproof.levelgen.level import Level, Role
-from tests.experts.search.worlds import BALL, BARS, GOAL, side_by_side, switchback
+from levelproof.levelgen.level import Level, Role, concatenate_levels
+from tests.experts.search.worlds import BALL, BARS, GOAL, switchback
 
 BAR = BARS.start
 GAP = jax.jit(lambda levels: gap(goals_of(levels), levels.state))
@@ -14,7 +14,7 @@ GAP = jax.jit(lambda levels: gap(goals_of(levels), levels.state))
 
 def measured(*levels: Level) -> np.ndarray:
     """Return gaps from one compiled program, padded to two levels with the last."""
-    many = side_by_side(*levels, *[levels[-1]] * (2 - len(levels)))
+    many = concatenate_levels([*levels, *[levels[-1]] * (2 - len(levels))])
     return np.asarray(GAP(many))[: len(levels)]
 
 

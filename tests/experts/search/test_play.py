@@ -8,11 +8,11 @@ import numpy as np
 
 from levelproof.experts.search.play import Arena, Walk, arena, decode, encode, fresh_walk, play
 from levelproof.experts.search.rows import from_rows, to_rows
-from levelproof.levelgen.batching import take
+from levelproof.levelgen.level import concatenate_levels
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.levelgen.task.rules import DEFAULT_RULES
-from tests.experts.search.worlds import broken, side_by_side, switchback, valley
+from tests.experts.search.worlds import broken, switchback, valley
 
 LANES, STEPS = 16, 256
 CHANCES = (0.02, 0.3)
@@ -20,7 +20,7 @@ RULES = replace(DEFAULT_RULES, max_timesteps=200)
 
 
 def ring_of_all() -> Arena:
-    return jax.jit(arena, static_argnums=(1, 2))(side_by_side(switchback(), valley(), broken()), LANES, CHANCES)
+    return jax.jit(arena, static_argnums=(1, 2))(concatenate_levels([switchback(), valley(), broken()]), LANES, CHANCES)
 
 
 def random_bits(seed: int) -> jax.Array:
@@ -41,7 +41,8 @@ def test_decode_inverts_encode() -> None:
 
 
 def test_rows_round_trip_states_exactly() -> None:
-    state = jax.device_get(jax.jit(task.reset)(take(side_by_side(switchback(), valley()), np.array([0, 1, 1]))).state)
+    levels = concatenate_levels([switchback(), valley(), valley()])
+    state = jax.device_get(jax.jit(task.reset)(levels).state)
     noisy = jax.tree.map(lambda x: x + np.arange(3, dtype=x.dtype) if x.dtype == np.float32 else ~x, state)
     back = jax.jit(lambda state: from_rows(to_rows(state), state))(noisy)
     jax.tree.map(np.testing.assert_array_equal, back, noisy)

@@ -82,10 +82,6 @@ def broken() -> Level:
     return level
 
 
-def side_by_side(*levels: Level) -> Level:
-    return jax.tree.map(lambda *xs: np.concatenate(xs, -1), *levels)
-
-
 def world(*, bars, bar_role, ball, goal, angles, thrust) -> Level:
     """One level: fixed bars (centre, half sides, angle), a ball that does not turn, its two thrusters, a fixed goal."""
     level = jax.tree.map(np.array, empty_level(SIZE, 1))

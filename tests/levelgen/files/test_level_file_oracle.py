@@ -9,7 +9,7 @@ import pytest
 
 from levelproof.levelgen.files.kinetix import level_from_kinetix
 from levelproof.levelgen.files.level_file import LevelFile, read_level_file, with_known_bindings, write_level_file
-from levelproof.levelgen.level import SIZES, Level
+from levelproof.levelgen.level import SIZES, Level, concatenate_levels
 from levelproof.levelgen.sampling.sampler import Distribution, sample_levels
 from levelproof.levelgen.task.rules import TaskParams, TaskState, advance
 from levelproof.physics.types import Size
@@ -55,8 +55,7 @@ def exported(size: Size, folder: Path, name: str, count: int = OURS) -> list[Pat
 
 
 def side_by_side(files: list[Path]) -> Level:
-    levels = [read_level_file(path).level for path in files]
-    return jax.tree.map(lambda *x: np.concatenate(x, -1), *levels)
+    return concatenate_levels([read_level_file(path).level for path in files])
 
 
 @pytest.mark.parametrize("size", SIZES)

@@ -12,7 +12,7 @@ import pytest
 
 from levelproof.experts.witness.witness import Record, replay, succeeds
 from levelproof.levelgen.files.level_file import MAX_BYTES, LevelFile, read_level_file, write_level_file
-from levelproof.levelgen.level import SIZES
+from levelproof.levelgen.level import SIZES, concatenate_levels
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.cli.main import main
@@ -64,8 +64,7 @@ def test_reference_opens_exported_levels(reference, split, tmp_path) -> None:
     for path in files:
         export(split, level_with(split, path.stem)["level_id"], path)
     theirs = open_in_reference(reference, files, tmp_path / "out.npz").levels()
-    ours = [read_level_file(path).level for path in files]
-    assert_same(jax.tree.map(lambda *x: np.concatenate(x, -1), *ours), theirs)
+    assert_same(concatenate_levels([read_level_file(path).level for path in files]), theirs)
 
 
 def test_export_rejects_invalid_arguments(split, tmp_path) -> None:

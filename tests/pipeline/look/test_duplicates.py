@@ -4,7 +4,6 @@ import dataclasses
 import json
 from pathlib import Path
 
-import jax
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -13,7 +12,7 @@ from levelproof.experts.labels import Label
 from levelproof.levelgen.files.level_file import LevelFile, read_level_file, write_level_file
 from levelproof.levelgen.identity.content import content_hashes
 from levelproof.levelgen.identity.signature import signatures
-from levelproof.levelgen.level import Level
+from levelproof.levelgen.level import Level, concatenate_levels
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs.schedule import WorkUnit
@@ -98,8 +97,7 @@ def committed(folder: Path, levels: list[Level]) -> Path:
     job = made_job(str(folder), "size=s", f"levels={len(levels)}")
     path, ids = split_path(job.out, job.budget, job.size), list(range(len(levels)))
     path.mkdir(parents=True)
-    side_by_side = jax.tree.map(lambda *x: np.concatenate(x, -1), *levels)
-    result = dataclasses.replace(made_result(ids, [Label.SOLVED] * len(ids)), levels=side_by_side)
+    result = dataclasses.replace(made_result(ids, [Label.SOLVED] * len(ids)), levels=concatenate_levels(levels))
     commit(job, path, WorkUnit(tuple(ids)), result)
     return path
 
