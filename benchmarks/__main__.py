@@ -32,7 +32,6 @@ BENCHMARKS = {  # name: (module, what it measures)
     "late": ("benchmarks.late", "which levels only a long search solves, and how"),
     "prior": ("benchmarks.prior", "what attempts of a policy before the search would find and save"),
     "ppo": ("benchmarks.ppo", "env steps/s of reinforcement learning over many levels, on one core and on all"),
-    "training": ("benchmarks.training", "env steps/s of rollout, update, and the program that does both"),
     "networks": (
         "benchmarks.networks",
         "multiply-adds of the experts' networks, and env steps/s of training with each",
