@@ -174,7 +174,7 @@ def _parse(text: str) -> Override:
             override = OverridesParser.create().parse_override(attempt)
             break
     else:
-        raise ConfigError(f"cannot read {text!r}: write settings as NAME=VALUE, as in levels=64.")
+        raise ConfigError(f"cannot read {text!r}: write settings as NAME=VALUE.")
     if override.is_add() or override.is_force_add() or override.is_delete():
         raise ConfigError(f"cannot use {text!r}: settings can be changed, not added or removed.")
     if override.is_sweep_override():

@@ -5,6 +5,7 @@ Imports nothing heavy before it knows the command, so that `levelproof --help` a
 
 import argparse
 import errno
+import re
 import sys
 import warnings
 from collections.abc import Sequence
@@ -42,7 +43,7 @@ def _run(argv: Sequence[str] | None) -> int:
     warnings.showwarning = lambda message, *_: print(f"Warning: {message}", file=sys.stderr)
     try:
         if unknown:
-            raise UserError(_no_option(unknown[0], takes_settings=bool({"settings", "words"} & vars(arguments).keys())))
+            raise UserError(_no_option(unknown, arguments))
         _check_paths(arguments)
         code = int(arguments.run(arguments) or Exit.DONE)
         sys.stdout.flush()  # now, so that a full disk is reported as an error
@@ -83,15 +84,17 @@ def _taken(arguments: argparse.Namespace, unknown: list[str]) -> list[str]:
     return unknown
 
 
-def _no_option(word: str, takes_settings: bool) -> str:
-    """Return the error for an argument that the command does not have."""
+def _no_option(unknown: Sequence[str], arguments: argparse.Namespace) -> str:
+    """Return the error for arguments that the command does not have; those behind an unknown option may be valid."""
+    word = next((word for word in unknown if word.startswith("-")), unknown[0])
     if not word.startswith("-"):
         return f"There is no argument {word}: --help lists them."
     if word == "--debug":
         return "--debug comes after the command, as in levelproof generate --debug."
-    example = "out=FOLDER" if word in ("-o", "--out") else "size=m"
-    advice = f"write settings as NAME=VALUE, as in {example}" if takes_settings else "--help lists the options"
-    return f"There is no option {word}: {advice}."
+    if not {"settings", "words"} & vars(arguments).keys():
+        return f"There is no option {word}: --help lists the options."
+    example = "out=FOLDER" if word in ("-o", "--out") else re.findall(r"\S+=\S+", arguments.example)[0]
+    return f"There is no option {word}: write settings as NAME=VALUE, as in {example}."
 
 
 def _check_paths(arguments: argparse.Namespace) -> None:
@@ -129,5 +132,5 @@ def _parser() -> argparse.ArgumentParser:
         )
         command.add_arguments(added)
         added.add_argument("--debug", action="store_true", help="show the traceback of an error")
-        added.set_defaults(run=command.run)
+        added.set_defaults(run=command.run, example=command.EXAMPLE)
     return parser
