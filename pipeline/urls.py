@@ -1,6 +1,7 @@
 """Paths that represent URLs, such as `Path("s3://bucket/split")`, although `Path` collapses their slashes."""
 
 import re
+import shlex
 from pathlib import Path
 
 from levelproof.pipeline.errors import UserError
@@ -17,6 +18,11 @@ def is_remote(path: Path) -> bool:
 def as_typed(path: Path) -> str:
     """Return a path or URL as the user typed it."""
     return "//".join([path.parts[0], "/".join(path.parts[1:])]) if is_remote(path) else str(path)
+
+
+def quoted(path: Path) -> str:
+    """Return a path or URL as an argument of a command that users can paste into a shell."""
+    return shlex.quote(as_typed(path))
 
 
 def require_known(path: Path) -> None:

@@ -82,7 +82,7 @@ def clone(splits: Sequence[Path], config: CloneConfig, out: Path, console: Conso
             if int(state.updates) < config.train.updates:
                 state = train(sources, config, state, run, console)
             run.save(state)
-    tell_done(out, tell)
+    tell_done(out, config.network.only_size(size), tell)
 
 
 def source_of(split: Path, config: CloneConfig, tell: Callable[[str], None]) -> PartedSplit:

@@ -113,7 +113,7 @@ def distill(split: Path, config: DistillConfig, out: Path, console: Console) -> 
         with recorded(out, note, COURSE, config.log, updates, policy_of, tell, require_ours) as run:
             now = update_until_done(taught, config, network, now, run, console)
             run.save(now)
-    tell_done(out, tell)
+    tell_done(out, network.only_size(size), tell)
 
 
 def levels_for(split: Path, config: DistillConfig, tell: Callable[[str], None]) -> ChosenLevels:

@@ -3,10 +3,10 @@
 import hashlib
 import json
 import math
-import shlex
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import reduce
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,7 +19,10 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from levelproof.configs.convert import plain
+from levelproof.configs.train import CURRICULA
 from levelproof.experts.networks.saved import CONFIG, WEIGHTS, Policy, named, policy_folder, save_policy, unnamed
+from levelproof.levelgen.level import name_of
+from levelproof.physics.types import Size
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.learn.metrics import METRICS
@@ -29,9 +32,12 @@ from levelproof.pipeline.store.locks import only_trainer
 from levelproof.pipeline.store.manifest import changes_text, differences
 from levelproof.pipeline.store.progress_bar import LINE_EVERY
 from levelproof.pipeline.store.provenance import device, versions
+from levelproof.pipeline.urls import quoted
 
 CHECKPOINT, RUN = "checkpoint.safetensors", "run.json"
 MADE_BY = "made_by"  # in the note: versions and devices that have trained the run, in turn
+# Key paths in notes of what was named, which may have moved: fingerprints and digests beside them identify it
+NAMED = ("splits", "split"), ("levels", "levels"), ("settings", "start")
 T = TypeVar("T")
 
 
@@ -67,7 +73,10 @@ def require_same_run(out: Path, note: dict[str, Any], free: Sequence[str] = ()) 
     if (before := note_in(out)) is None:
         if (out / CONFIG).exists():
             raise UserError(f"{out} has a policy already: choose another folder with -o.")
-    elif changes := differences(_without(_without(before, (MADE_BY,)), free), _without(note, free)):
+        return
+    ours = note.get("settings", {}).get("levels")
+    paths = [(MADE_BY,), free, *NAMED, *([] if ours in CURRICULA else [("settings", "levels")])]
+    if changes := differences(*(reduce(_without, paths, one) for one in (before, note))):
         named = {
             name.removeprefix("settings."): change
             for name, change in changes.items()
@@ -102,7 +111,9 @@ def learned_with() -> dict[str, str]:
 
 
 def _without(note: Any, path: Sequence[str]) -> Any:
-    """Return JSON without the value at a path of keys; unchanged if it has none, as in another command's note."""
+    """Return JSON without the value at a path of keys, in lists of each entry; unchanged if it has none."""
+    if isinstance(note, list):
+        return [_without(one, path) for one in note]
     if not path or not isinstance(note, dict):
         return note
     name, *inner = path
@@ -160,9 +171,9 @@ def settings_without(config: Any, names: Sequence[str]) -> dict[str, Any]:
     return {name: value for name, value in plain(config).items() if name not in names}
 
 
-def tell_done(out: Path, tell: Callable[[str], None]) -> None:
-    """Tell the user where the policy is, and the next command."""
-    tell(f"The policy is in {out}. Next: levelproof evaluate {shlex.quote(str(out))}")
+def tell_done(out: Path, only: Size | None, tell: Callable[[str], None]) -> None:
+    """Tell the user where the policy is, and the next command; `only` is the one size that it plays, if any."""
+    tell(f"The policy is in {out}. Next: levelproof evaluate {quoted(out)}{f' --size {name_of(only)}' if only else ''}")
 
 
 def weights_digest(policy: str) -> str | None:

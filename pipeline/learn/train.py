@@ -93,7 +93,7 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
         with recorded(out, note, COURSE, config.log, steps, policy_of, tell, require_ours) as run:
             learner = update_until_done(programs, learner, table, params, recipe, config.interval, run, console)
             run.save(learner)
-    tell_done(out, tell)
+    tell_done(out, recipe.network.only_size(source.levels.size), tell)
 
 
 def prepared_cores(config: TrainConfig, note: dict[str, Any] | None) -> int:

@@ -5,6 +5,7 @@ import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -13,6 +14,7 @@ from rich.console import Console
 
 import levelproof
 from levelproof.experts.networks.saved import WEIGHTS
+from levelproof.levelgen.level import size_of
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.learn.clone import COURSE
 from levelproof.pipeline.learn.folder import (
@@ -24,6 +26,7 @@ from levelproof.pipeline.learn.folder import (
     note_in,
     require_same_run,
     shown,
+    tell_done,
     with_stack,
     write_note,
     writing_run,
@@ -83,6 +86,30 @@ def test_run_that_saved_nothing_gives_way_to_other_settings(tmp_path: Path) -> N
     (tmp_path / CHECKPOINT).touch()
     with pytest.raises(UserError, match="seed was 0, now 1"):
         require_same_run(tmp_path, {"settings": {"seed": 1}})
+
+
+def test_run_continues_wherever_its_levels_and_its_start_are(tmp_path: Path) -> None:
+    def note(folder: str, levels: str, start: str = "5e") -> dict[str, Any]:
+        settings = {"start": f"{folder}policy", "levels": levels}
+        facts = {"levels": levels, "content": "7a"}
+        return {"splits": [{"split": f"{folder}s", "ids": "9c"}], "settings": settings, "levels": facts, "start": start}
+
+    (tmp_path / CHECKPOINT).touch()
+    write_note(tmp_path, note("", "mine"))
+    require_same_run(tmp_path, note("/moved/", "/moved/mine"))
+    for other in note("", "mine", start="00"), note("", "uniform"):
+        with pytest.raises(UserError, match="has a run with other settings or levels"):
+            require_same_run(tmp_path, other)
+    write_note(tmp_path, note("", "uniform"))
+    with pytest.raises(UserError, match="levels was uniform, now learnability"):
+        require_same_run(tmp_path, note("", "learnability"))
+
+
+@pytest.mark.parametrize(("size", "command"), [(None, "'my policy'"), ("m", "'my policy' --size m")])
+def test_next_command_names_the_only_size_that_a_policy_plays(size: str | None, command: str) -> None:
+    told = list[str]()
+    tell_done(Path("my policy"), size_of(size) if size else None, told.append)
+    assert told == [f"The policy is in my policy. Next: levelproof evaluate {command}"]
 
 
 def test_what_a_killed_command_left_is_removed(tmp_path: Path) -> None:
