@@ -30,7 +30,6 @@ from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 from levelproof.pipeline.store.origins import RECORD
 from levelproof.pipeline.store.progress_bar import ProgressBar
-from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.seed.columns import KEPT, ROW_GROUP, SCHEMA
 from levelproof.pipeline.store.seed.file import SUFFIX
 from levelproof.pipeline.store.seed.packed import pack_witness
@@ -39,9 +38,10 @@ from levelproof.pipeline.store.seed.source import LevelSource
 from levelproof.pipeline.store.seed.worlds import pack_worlds
 from levelproof.pipeline.store.seed.write import seed_bytes
 from levelproof.pipeline.store.shard import STATES_DIFFER, Report, Unlike
+from levelproof.pipeline.urls import as_typed, quoted
 from levelproof.pipeline.words import many
 
-NAMED = 100  # levels that a message lists at most
+NAMED = 30  # levels that a message lists at most, so that errors of MAX_LENGTH characters have room for them
 READ = (
     "content_hash", "label_reason", "witness", "size", "budget", "shard", "row", "versions", "engine", "device", *KEPT,
 )  # fmt: skip
@@ -153,7 +153,7 @@ def _witnesses(manifest: Manifest, rows: pa.Table, report: Report) -> tuple[list
     if wrong.any():
         raise Failure(
             f"The first episode of level {rows['level_id'][int(wrong.argmax())]} does not end at the goal as its row "
-            f"says: run `levelproof verify {manifest.split}`."
+            f"says: run `levelproof verify {quoted(manifest.split)}`."
         )
     live = np.asarray(action_mask(tree_of(Level, arrays, "level/")))
     packed = [pack_witness(action[: steps[i], :, i], live[:, i]) for i in lanes]
@@ -168,7 +168,7 @@ def _require_alike(differing: Sequence[Unlike], where: str | None) -> None:
     remedy = "export them on the machine that made them"
     if len(ids) <= NAMED:
         others = both(where, f"level_id NOT IN ({', '.join(map(str, ids))})")
-        remedy += f', or leave them out with --where "{others}"'
+        remedy += f', or leave them out with `levelproof export --format seed --where "{others}"`'
     raise Failure(
         f"{STATES_DIFFER} {many(len(ids), 'level')}, such as {ids[0]}, so checksums would not be those of the stored "
         f"states: {remedy}."

@@ -16,13 +16,15 @@ import pytest
 from rich.console import Console
 
 import levelproof
+from levelproof.configs.errors import readable
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.labels import Label
 from levelproof.experts.witness.episode import repeated_rows
+from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.pipeline.dataset.batch import Batch
 from levelproof.pipeline.errors import Exit, Failure, UserError
-from levelproof.pipeline.exchange.seed import export_seed
+from levelproof.pipeline.exchange.seed import NAMED, _require_alike, export_seed
 from levelproof.pipeline.jobs.grow import _job, grow
 from levelproof.pipeline.jobs.grower import Grower, grow_unit
 from levelproof.pipeline.jobs.schedule import Order, WorkUnit
@@ -32,6 +34,7 @@ from levelproof.pipeline.store.seed.columns import SCHEMA, WRITTEN
 from levelproof.pipeline.store.seed.packed import MAX_RUN, pack_witness, unpack_witnesses
 from levelproof.pipeline.store.seed.shard import SeedShard, play_seeds
 from levelproof.pipeline.store.seed.worlds import pack_worlds, unpack_worlds
+from levelproof.pipeline.store.shard import Unlike
 from levelproof.pipeline.verify.verify import examine
 from tests.pipeline.command import ROOT
 from tests.pipeline.made import assert_same, honest_split, made_level, made_split
@@ -349,6 +352,15 @@ def test_export_refuses_a_row_that_its_episode_belies(split: Path, tmp_path: Pat
     with pytest.raises(Failure, match=sentence):
         export_seed(forged, None, out)
     assert not out.exists()
+
+
+def test_condition_that_leaves_out_levels_that_differ_is_shown_whole(tmp_path: Path) -> None:
+    for count, shown in (NAMED, True), (NAMED + 1, False):
+        ids = list(range(MAX_LEVEL_ID - count, MAX_LEVEL_ID))
+        with pytest.raises(Failure) as error:
+            _require_alike([Unlike(tmp_path, ids, ids, count)], "label = 'solved'")
+        condition = f"(label = 'solved') AND level_id NOT IN ({', '.join(map(str, ids))})"
+        assert (condition in readable(str(error.value))) == shown
 
 
 def test_export_refuses_settings_that_no_seed_file_can_have(
