@@ -143,7 +143,7 @@ def load_policy(folder: str | os.PathLike[str]) -> Policy:
         room = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(wanted))
         params = unnamed(wanted, load(_read(path / WEIGHTS, room + MAX_HEADER)))
     except FileNotFoundError:
-        raise PolicyError(f"There is no policy in {path}: `levelproof clone SPLIT -o {path}` makes one.") from None
+        raise PolicyError(f"There is no policy in {path}: `levelproof clone SPLIT -o policy` makes one.") from None
     except PolicyError:
         raise
     except (OSError, LookupError, TypeError, ValueError, OverflowError, RecursionError, SafetensorError) as error:

@@ -20,7 +20,7 @@ from levelproof.experts.evaluation import (
     play_sampled,
     play_sticky,
 )
-from levelproof.experts.networks.saved import BUILTIN, Policy
+from levelproof.experts.networks.saved import BUILTIN, CONFIG, Policy
 from levelproof.levelgen.level import SIZES, name_of
 from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.errors import UserError
@@ -37,6 +37,7 @@ from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.progress_bar import ProgressBar
 from levelproof.pipeline.tables import console_for_tables, folded
+from levelproof.pipeline.urls import as_typed
 from levelproof.pipeline.words import many
 
 ATTEMPTS = 8
@@ -180,6 +181,8 @@ def _contestant(path: Path, title: str) -> _Contestant:
     if path.suffix == AGENT_SUFFIX:
         name = AGENT if title == POLICY else title
         return _Contestant(path, name, {name: _Entrant(agent_in(path))})
+    if (path.is_file() or is_split(path)) and not (path / CONFIG).exists():
+        raise UserError(f"{as_typed(path)} is not a policy: name a policy's folder; levels go after --on.")
     policy = policy_at(path)
     sampled = _Entrant(play_sampled(policy.network), policy.params)
     greedy = _Entrant(play_most_probable(policy.network), policy.params, chance=False)
