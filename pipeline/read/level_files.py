@@ -91,9 +91,10 @@ def _origin_of(path: Path, job: JobConfig) -> Origin:
     except ValueError as error:
         raise LevelFileError(f"Cannot use the level file {path}: {error!s:.300}") from None
     if other := _other_rules(file, job):
+        settings = shlex.join([f"level_files={path}", *other])
         raise LevelFileError(
-            f"Cannot use the level file {path}: its rules differ from this command's, so label it "
-            f"separately: levelproof generate {shlex.quote(f'level_files={path}')} {' '.join(other)}"
+            f"Cannot use the level file {path}: its rules differ from this command's, so label it separately: run "
+            f"`levelproof generate` with your other settings, {settings} and another out=."
         )
     return Origin(content_hashes(file.level)[0], str(path), size)
 

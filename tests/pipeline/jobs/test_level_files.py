@@ -78,7 +78,8 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert any("copy.json has the same level as" in line and "a.json" in line for line in messages)
     assert any(line.startswith("Cannot use the level file") and "bad.json: it is not JSON" in line for line in messages)
     assert any(
-        "rules.json: its rules differ from this command's" in line and "task.frame_skip=4" in line for line in messages
+        "rules.json: its rules differ from this command's" in line and "rules.json task.frame_skip=4 and an" in line
+        for line in messages
     )
     assert messages[-1] == "2 of the level files in mine were left out, for the reasons above."
     return folder
