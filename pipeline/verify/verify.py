@@ -7,7 +7,6 @@ must match its row's content hash, and its witness must reach the goal.
 """
 
 import json
-import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -62,6 +61,7 @@ from levelproof.pipeline.store.remote import is_listed, is_remote, stale_index
 from levelproof.pipeline.store.runs import runs, runs_text, without
 from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.store.shard import Shard
+from levelproof.pipeline.urls import quoted
 from levelproof.pipeline.verify.evidence import COLUMNS, Evidence, Recipe, same_stack
 from levelproof.pipeline.verify.findings import Findings, why_not_repaired
 from levelproof.pipeline.verify.seeds import examine_seeds
@@ -94,8 +94,9 @@ def verify(split: Path, as_json: bool, console: Console) -> Exit:
         print(json.dumps(findings.as_json(), indent=2))
     else:
         print(findings.report(split))
-        if findings.wrong and not is_remote(split) and not why_not_repaired(split, findings):
-            print(f"Next:  levelproof verify {shlex.quote(str(split))} --repair")
+        repairable = findings.config and not is_remote(split) and not why_not_repaired(split, findings)
+        if findings.wrong and repairable:
+            print(f"Next:  levelproof verify {quoted(split)} --repair")
     return Exit.FAILED if findings.wrong else Exit.DONE
 
 

@@ -343,6 +343,10 @@ def test_repair_stores_as_the_noted_command_if_no_fragment_is_left(split: Path) 
         path.write_bytes(b"PAR1")
     job = repairing._job(split, examine(split), [])
     assert (job.stored, job.keep_experts) == ("density=witness key_every=16", True)
+    verify = ["verify", str(split)]
+    assert here(verify, split).stdout.endswith(f"Next:  levelproof verify {split} --repair\n")
+    (split / JOB).unlink()
+    assert "Next:" not in here(verify, split).stdout, "nothing says what to make"
 
 
 @pytest.mark.parametrize(
