@@ -6,6 +6,7 @@ from pathlib import Path
 
 from levelproof.pipeline.cli.command import add_split
 from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.urls import quoted
 
 SUMMARY = "write levels and their witnesses for other programs"
 EXAMPLE = """\
@@ -90,8 +91,8 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.format == JSON:
         if level_id is None or where is not None:
             raise UserError(
-                f"The format {JSON} is for one level: give its id, as in levelproof export {split} 7, without --where; "
-                f"for many levels, set --format to one of {', '.join(FORMATS)}."
+                f"The format {JSON} is for one level: give its id, as in `levelproof export {quoted(split)} LEVEL_ID`, "
+                f"without --where; for many levels, set --format to one of {', '.join(FORMATS)}."
             )
         from levelproof.pipeline.exchange.level_json import export
 

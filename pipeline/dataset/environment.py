@@ -15,6 +15,7 @@ from levelproof.physics.types import Size
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.read.levels import COLUMNS, levels_of, rules_of
 from levelproof.pipeline.read.select import require_selected
+from levelproof.pipeline.urls import quoted
 
 
 def make(
@@ -88,7 +89,8 @@ def _of_split(
     rows = manifest.table
     if not rows.num_rows:
         raise UserError(
-            f"The split {split} has no level for which {where} holds: `levelproof inspect {split}` shows its levels."
+            f"The split {split} has no level for which {where} holds: `levelproof inspect {quoted(Path(split))}` shows "
+            "its levels."
         )
     levels = levels_of(manifest, rows, in_command=False)
     env, params = environment.make(levels, *kinds, rules or rules_of(manifest), *resets)

@@ -25,6 +25,7 @@ from levelproof.pipeline.store.manifest import require_manifest
 from levelproof.pipeline.store.mapped import find_table, share_table
 from levelproof.pipeline.store.seed.file import describe_seed, is_seed, name_of_table, seed_files
 from levelproof.pipeline.store.seed.source import LevelSource
+from levelproof.pipeline.urls import quoted
 
 ALWAYS_COLUMNS = ("label", "steps_to_goal", *COLUMNS)
 T = TypeVar("T")
@@ -68,7 +69,7 @@ class TrajectoryRows:
         rows = select(manifest.table.filter(pc.is_valid(manifest.table["shard"])), where)  # pyright: ignore[reportAttributeAccessIssue]
         if not rows.num_rows:
             what = "has no trajectories yet" if where is None else f"has no trajectories for which {where} holds"
-            raise UserError(f"The split {split} {what}: `levelproof inspect {split}` shows what it has.")
+            raise UserError(f"The split {split} {what}: `levelproof inspect {quoted(split)}` shows what it has.")
         rows = rows.cast(schema_of(rows.column_names))  # dictionary-encoded only while all rows were in memory
         self.table: pa.Table = rows.combine_chunks()
         self.table = self._shared(self._kind, self.table)

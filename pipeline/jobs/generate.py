@@ -30,9 +30,9 @@ from levelproof.pipeline.store.layout import quarantine_path
 from levelproof.pipeline.store.manifest import Manifest, read_manifest
 from levelproof.pipeline.store.origins import Origin, require_same_levels
 from levelproof.pipeline.store.paused import prune_paused
-from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.runs import ascending, inside, merged, runs
 from levelproof.pipeline.store.split import writing
+from levelproof.pipeline.urls import as_typed, quoted
 from levelproof.pipeline.words import many
 
 
@@ -224,7 +224,7 @@ def _spent(manifest: Manifest, made: np.ndarray, spent: EnvSteps) -> str:
 
 def _closing(split: Path, manifest: Manifest, wanted: np.ndarray, given_up: list[WorkUnit], spent: str) -> None:
     """Print where the split is, its labels, and the next command to type."""
-    labels, folder = manifest.counts(np.isin(manifest.level_ids, wanted)), shlex.quote(as_typed(split))
+    labels, folder = manifest.counts(np.isin(manifest.level_ids, wanted)), quoted(split)
     total = sum(labels.values())
     counts = ", ".join(f"{count} {label}" for label, count in labels.items())
     print(f"{as_typed(split)}: {many(total, 'level') + ', ' + counts if total else 'nothing is committed'}.")

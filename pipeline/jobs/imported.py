@@ -40,6 +40,7 @@ from levelproof.pipeline.store.remote import require_folder
 from levelproof.pipeline.store.runs import runs
 from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.store.split import writing
+from levelproof.pipeline.urls import quoted
 from levelproof.pipeline.words import many
 
 UNIT_BYTES = 2**28  # bytes of a unit's records in the reference's format; memory holds a few copies
@@ -218,4 +219,4 @@ def _closing(folder: Folder, split: Path, manifest: Manifest) -> None:
     print(f"{split}: {many(total, 'level')} of {folder.path}, {counts}.{left}")
     if total:
         print(f"{reached / total:.1%} reach the goal here.")
-        print(f"Next:  levelproof inspect {shlex.quote(str(split))}")
+        print(f"Next:  levelproof inspect {quoted(split)}")

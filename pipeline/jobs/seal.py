@@ -1,6 +1,5 @@
 """The jobs that seal: `levelproof seal`, and `levelproof generate` while its workers run."""
 
-import shlex
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -22,10 +21,10 @@ from levelproof.pipeline.store.job_note import note_density
 from levelproof.pipeline.store.layout import fragment_path, unit_name
 from levelproof.pipeline.store.manifest import Fragment, require_manifest
 from levelproof.pipeline.store.progress_bar import ProgressBar
-from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.scratch import written_disk
 from levelproof.pipeline.store.seal import Piece, seal
 from levelproof.pipeline.store.split import taken
+from levelproof.pipeline.urls import as_typed, quoted
 from levelproof.pipeline.words import many
 
 
@@ -75,7 +74,7 @@ def seal_split(
     verb, into = ("rewrote", "as") if density else ("merged", "into")
     done = f"{verb} {many(merged, 'fragment')} {into} {len(groups):,}" if groups else "there was nothing to seal"
     print(f"{as_typed(split)}: {done}; it has {many(levels, 'level')} in {many(fragments, 'fragment')} now.")
-    print(f"Next:  levelproof inspect {shlex.quote(as_typed(split))}")
+    print(f"Next:  levelproof inspect {quoted(split)}")
 
 
 class _Stopped(Exception):
@@ -158,5 +157,5 @@ class Sealer:
             return
         self._broken = True
         reason = str(error) if isinstance(error, LevelproofError) else f"{type(error).__name__}: {error}"
-        split = shlex.quote(as_typed(self._split))
+        split = quoted(self._split)
         self._tell(f"Not sealed ({reason.rstrip('.')}): run `levelproof seal {split}` when this job has ended.")

@@ -26,6 +26,7 @@ from levelproof.pipeline.store.job_note import sound_note
 from levelproof.pipeline.store.manifest import fragment_paths, refuse_folder_of_splits, require_manifest
 from levelproof.pipeline.store.remote import as_typed, is_remote
 from levelproof.pipeline.store.seed.file import is_seed
+from levelproof.pipeline.urls import quoted
 
 AT_ONCE = 256  # witnesses per read
 
@@ -111,7 +112,7 @@ def _of_split(split: Path, where: str | None, count: int | None) -> MeasuredLeve
     rows = manifest.table
     if not rows.num_rows:
         raise UserError(
-            f"{split} has no level that meets the condition: `levelproof inspect {split}` shows its levels."
+            f"{split} has no level that meets the condition: `levelproof inspect {quoted(split)}` shows its levels."
         )
     levels, solved = levels_of(manifest, rows), labelled(rows, [Label.SOLVED])
     name = f"{as_typed(split)}, {name_of(levels.size)}"

@@ -6,7 +6,6 @@ only the licence must be chosen by a person.
 
 import io
 import os
-import shlex
 from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
@@ -35,7 +34,7 @@ from levelproof.pipeline.store.named import bytes_named
 from levelproof.pipeline.store.remote import as_typed, is_listed, is_remote, require_folder
 from levelproof.pipeline.store.seed.file import SUFFIX, is_seed
 from levelproof.pipeline.store.shard import stored_bytes
-from levelproof.pipeline.urls import HUB
+from levelproof.pipeline.urls import HUB, quoted
 from levelproof.pipeline.version import __version__
 
 README = "README.md"
@@ -92,7 +91,7 @@ def card(splits: Sequence[Path], out: Path | None, options: CardOptions) -> None
         print(f"Next:  copy them to {as_typed(root)}")
         return
     excluded = '--exclude "*.lock" --exclude "*/events/*" --exclude "*/.*"'
-    print(f"Next:  hf upload {options.repo or 'USER/NAME'} {shlex.quote(str(folder))} . --repo-type dataset {excluded}")
+    print(f"Next:  hf upload {options.repo or 'USER/NAME'} {quoted(folder)} . --repo-type dataset {excluded}")
 
 
 def _above(split: Path) -> Path:

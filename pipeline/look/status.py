@@ -11,8 +11,8 @@ from levelproof.pipeline.store.layout import JOB, QUARANTINE
 from levelproof.pipeline.store.locks import is_written
 from levelproof.pipeline.store.manifest import read_manifest, require_manifest
 from levelproof.pipeline.store.quarantine import given_up
-from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.runs import inside, runs_text
+from levelproof.pipeline.urls import as_typed, quoted
 from levelproof.pipeline.words import many
 
 
@@ -44,7 +44,7 @@ def read_status(split: Path, say: Callable[[str], None] = lambda _: None) -> dic
     except (FileNotFoundError, NotADirectoryError):
         require_manifest(split, [])
         raise UserError(
-            f"{as_typed(split)} has no {JOB}, which says what was requested: `levelproof inspect {as_typed(split)}` "
+            f"{as_typed(split)} has no {JOB}, which says what was requested: `levelproof inspect {quoted(split)}` "
             "shows what it has."
         ) from None
     except NoteError:

@@ -12,6 +12,7 @@ from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.named import open_shard
 from levelproof.pipeline.store.remote import at_once
 from levelproof.pipeline.store.shard import Part, Report, Shard, read_together, warn_unlike
+from levelproof.pipeline.urls import quoted
 
 COLUMNS = ("level_id", "size", "shard", "row")  # required of rows
 
@@ -112,6 +113,6 @@ def parts_of(split: Path, rows: pa.Table, opened: Open = open_shard) -> tuple[li
         if known != [ids[i] for i in mine]:
             raise Failure(
                 f"The shard {shard.path} does not have the levels that the manifest lists: "
-                f"run `levelproof verify {split}`."
+                f"run `levelproof verify {quoted(split)}`."
             )
     return parts, [*by_shard.values()]

@@ -21,6 +21,7 @@ from levelproof.pipeline.store.columns import COLUMNS, MANIFEST_VERSION, OLDEST_
 from levelproof.pipeline.store.formats import CONFIG_KEY, DENSITIES_KEY, DIGESTS_KEY, HASH_KEY, SEALED_KEY, VERSION_KEY
 from levelproof.pipeline.store.layout import ids_of
 from levelproof.pipeline.store.remote import FileChanged, mended
+from levelproof.pipeline.urls import quoted
 
 FULL = (stored_as("full"),)
 DENSITIES = {stored_as(density, every) for density in get_args(Density) for every in KEYS_EVERY}
@@ -85,7 +86,7 @@ def read_fragment(
     except DAMAGE as error:
         raise unread(path, error) or Failure(
             f"The fragment {path} is damaged ({type(error).__name__}): "
-            + mended(path, f"run `levelproof verify {path.parent.parent} --repair` to regenerate its levels.")
+            + mended(path, f"run `levelproof verify {quoted(path.parent.parent)} --repair` to regenerate its levels.")
         ) from error
     return fragment, table
 

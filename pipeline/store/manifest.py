@@ -35,7 +35,7 @@ from levelproof.pipeline.store.remote import INDEX, is_listed, is_remote, stale_
 from levelproof.pipeline.store.runs import ascending
 from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.store.seed.rows import seed_parts
-from levelproof.pipeline.urls import require_known
+from levelproof.pipeline.urls import quoted, require_known
 
 MAX_SHOWN = 6  # differing settings that an error lists
 # Fragments read at once: more than cores, because shared folders have latency; not many more, because threads wait for
@@ -379,7 +379,7 @@ def _nothing_at(split: Path) -> str:
     require_known(split)
     refuse_folder_of_splits(split)
     if not is_remote(split) and (split / JOB).exists():
-        return f"Nothing is committed in {split} yet: `levelproof status {split}` shows its progress."
+        return f"Nothing is committed in {split} yet: `levelproof status {quoted(split)}` shows its progress."
     what = f"Nothing is committed in {split} yet" if split.is_dir() else f"There is no split at {split}"
     return f"{what}: give a folder such as data/128k/s that `levelproof generate` made."
 

@@ -39,6 +39,7 @@ from levelproof.pipeline.store.fields import same_bits
 from levelproof.pipeline.store.formats import FLAT, SHARD_VERSION, Encoding, FieldSpec, field_table
 from levelproof.pipeline.store.packing import empty, pack, unpack
 from levelproof.pipeline.store.remote import at_once, is_remote, mended, stored_in
+from levelproof.pipeline.urls import quoted
 
 FORMAT = "levelproof.shard"
 # What reading untrusted bytes can raise
@@ -328,7 +329,7 @@ def damaged(shard: Path, error: Exception) -> Failure:
     reason = str(error) if isinstance(error, ContentsError) else type(error).__name__
     return Failure(
         f"The shard {shard} is missing or damaged ({reason}): "
-        + mended(shard, f"run `levelproof verify {shard.parent.parent} --repair` to regenerate its levels.")
+        + mended(shard, f"run `levelproof verify {quoted(shard.parent.parent)} --repair` to regenerate its levels.")
     )
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 from levelproof.configs.schema import FROM_RECORDS, is_grown
 from levelproof.pipeline.store.origins import Origin
-from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.runs import runs, runs_text
 from levelproof.pipeline.store.seed.file import is_seed
+from levelproof.pipeline.urls import as_typed, quoted
 from levelproof.pipeline.words import many
 
 COUNTS = ("levels", "shards", "witnesses", "same_bits")
@@ -96,7 +96,7 @@ def why_not_repaired(split: Path, findings: Findings) -> str | None:
     if config.get("distribution") == FROM_RECORDS:
         return (
             f"The split {split} was imported, so its levels cannot be regenerated: delete it, and import its folder of "
-            f"trajectories again with `levelproof import FOLDER -o {split}`."
+            f"trajectories again with `levelproof import FOLDER -o {quoted(split)}`."
         )
     return None
 

@@ -26,6 +26,7 @@ from levelproof.pipeline.store.created import new_folder
 from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.manifest import require_manifest
 from levelproof.pipeline.store.progress_bar import shown_blocks
+from levelproof.pipeline.urls import quoted
 from levelproof.pipeline.version import __version__
 from levelproof.pipeline.words import many
 
@@ -74,7 +75,7 @@ def export_minari(split: Path, where: str | None, out: Path, kind: ActionKind = 
         )
     print(
         f"{out}: {many(episodes, 'episode')} of {many(rows.num_rows, 'level')}, {many(steps, 'step')}.\n"
-        f'Next:  MINARI_DATASETS_PATH={out} and, in Python, minari.load_dataset("{dataset_id}")'
+        f'Next:  MINARI_DATASETS_PATH={quoted(out)} and, in Python, minari.load_dataset("{dataset_id}")'
     )
 
 

@@ -8,7 +8,6 @@ attempt if one plays.
 
 import json
 import math
-import shlex
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
@@ -37,7 +36,7 @@ from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.created import new_folder
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 from levelproof.pipeline.store.progress_bar import shown_blocks
-from levelproof.pipeline.store.remote import as_typed
+from levelproof.pipeline.urls import as_typed, quoted
 from levelproof.pipeline.words import many
 
 SITE = Path(__file__).parent / "site"
@@ -84,7 +83,7 @@ def gallery(split: Path, out: Path, where: str | None, most: int, policy: Path |
     sample = f"{count:,} of {many(matching, 'level')}, spread evenly over their ids,"
     some = many(count, "level") if count == matching else sample
     print(f"{out / 'index.html'}: {some} of {as_typed(split)}, {size / 1e6:,.1f} MB. Open it in a browser, or:")
-    print(f"{Path(sys.executable).name} -m webbrowser {shlex.quote(str(out / 'index.html'))}")
+    print(f"{Path(sys.executable).name} -m webbrowser {quoted(out / 'index.html')}")
 
 
 def _is_gallery(folder: Path) -> bool:
@@ -178,7 +177,7 @@ def _about(manifest: Manifest, matching: int, where: str | None, columns: list[d
     rules = rules_of(manifest)
     return {
         "split": as_typed(manifest.split),
-        "quoted": shlex.quote(as_typed(manifest.split)),
+        "quoted": quoted(manifest.split),
         "levels": manifest.table.num_rows,
         "found": matching,
         "where": where,

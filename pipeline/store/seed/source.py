@@ -19,8 +19,8 @@ from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.types import Size
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.store.formats import FIRST_VERSION
-from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.seed.worlds import unpack_worlds
+from levelproof.pipeline.urls import as_typed, quoted
 
 
 @dataclass(frozen=True)
@@ -107,5 +107,5 @@ def without_levels(path: Path) -> UserError:
     """Return the error for a seed file that was written without its levels."""
     return UserError(
         f"The seed file {as_typed(path)} does not contain its levels: add them from their level files with "
-        f"`levelproof export {as_typed(path)} --format seed --levels FOLDER -o whole.parquet`."
+        f"`levelproof export {quoted(path)} --format seed --levels FOLDER -o whole.parquet`."
     )

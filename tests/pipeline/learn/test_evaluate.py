@@ -147,8 +147,9 @@ def test_split_in_which_nothing_is_committed_is_named(tmp_path: Path) -> None:
     note_job(tmp_path / "data/128k/s", job, ["levelproof", "generate"], [(0, 3)])
     done = here(["evaluate", "--on", "data/128k/s", *ONCE], tmp_path)
     assert_refused(done, 2, "Nothing is committed in data/128k/s yet")
-    done = here(["train", "levels=data/128k/s", "-o", "policy"], tmp_path)
-    assert_refused(done, 2, "Nothing is committed in data/128k/s yet: `levelproof status data/128k/s` shows")
+    (tmp_path / "data").rename(tmp_path / "my data")
+    done = here(["train", "levels=my data/128k/s", "-o", "policy"], tmp_path)
+    assert_refused(done, 2, "Nothing is committed in my data/128k/s yet: `levelproof status 'my data/128k/s'` shows")
 
 
 def test_folder_of_splits_is_named(split: Path, tmp_path: Path) -> None:
@@ -160,6 +161,14 @@ def test_folder_of_splits_is_named(split: Path, tmp_path: Path) -> None:
     assert_refused(done, 2, "data is not a split, but a folder of 1")
     done = here(["train", "levels=learnabilty", "-o", "policy"], tmp_path)
     assert_refused(done, 2, "no levels at learnabilty (did you mean learnability?)")
+
+
+def test_levels_in_place_of_a_policy_are_named(split: Path, tmp_path: Path) -> None:
+    shutil.copytree(split, tmp_path / "data/128k/s")
+    (tmp_path / "level.json").touch()
+    for levels in "data/128k/s", "level.json":
+        sentence = f"{levels} is not a policy: name a policy's folder; levels go after --on"
+        assert_refused(here(["evaluate", levels, *ONCE], tmp_path), 2, sentence)
 
 
 @pytest.mark.parametrize(
