@@ -16,7 +16,7 @@ from levelproof.levelgen.batching import take
 from levelproof.levelgen.identity.content import content_hashes
 from levelproof.levelgen.sampling.sampler import CHUNK
 from levelproof.pipeline.exchange.tables import columns_for
-from levelproof.pipeline.read.levels import levels_of
+from levelproof.pipeline.read.levels import levels_of, with_known_costs
 from levelproof.pipeline.read.select import columns_in, select_some
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.columns import COLUMNS
@@ -65,7 +65,8 @@ def _groups(split: Path, ids: np.ndarray) -> Iterator[pa.Table]:
     with ProgressBar("levels", len(ids), Console(stderr=True)) as progress:
         for first in range(0, len(ids), GROUP):
             manifest, group = require_manifest(split, level_ids=ids[first : first + GROUP]), []
-            for rows in (manifest.table.slice(block, CHUNK) for block in range(0, manifest.table.num_rows, CHUNK)):
+            table = with_known_costs(manifest)
+            for rows in (table.slice(block, CHUNK) for block in range(0, table.num_rows, CHUNK)):
                 group.append(with_worlds(manifest, rows))
                 progress.advance(rows.num_rows)
             yield pa.concat_tables(group)

@@ -9,8 +9,6 @@ from jaxtyping import Float
 
 from levelproof.experts.labels import Label
 from levelproof.experts.steps import Seconds
-from levelproof.pipeline.store.manifest import Manifest
-from levelproof.pipeline.store.seed.rows import COSTS
 from levelproof.pipeline.words import number
 
 READ = ("label", "device", "seconds")  # manifest columns that cost_of needs
@@ -36,15 +34,6 @@ def cost_of(rows: pa.Table) -> dict[str, Any] | None:
         "seconds": seconds,
         "per_solved": total / solved if solved else None,
     }
-
-
-def with_known_costs(manifest: Manifest) -> pa.Table:
-    """Return the manifest's rows, with null for costs that seeds left out: they are read as 0."""
-    rows = manifest.table
-    for name in COSTS if manifest.repeats else ():
-        if (at := rows.schema.get_field_index(name)) >= 0:
-            rows = rows.set_column(at, rows.field(at), pa.nulls(rows.num_rows, rows.field(at).type))
-    return rows
 
 
 def seconds_of(rows: pa.Table) -> Float[np.ndarray, " row"]:

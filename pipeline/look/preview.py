@@ -14,10 +14,9 @@ from levelproof.levelgen.pictures.raster import rasterise
 from levelproof.levelgen.pictures.scene import scene_of
 from levelproof.levelgen.pictures.shapes import Scene
 from levelproof.levelgen.pictures.words import Caption
-from levelproof.pipeline.look.cost import with_known_costs
 from levelproof.pipeline.look.show import recorded_film
 from levelproof.pipeline.look.spread import spread
-from levelproof.pipeline.read.levels import levels_of, rules_of
+from levelproof.pipeline.read.levels import levels_of, rules_of, with_known_costs
 from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.store.columns import COLUMNS
 from levelproof.pipeline.store.contents import table_for

@@ -11,8 +11,8 @@ import pyarrow as pa
 from rich.console import Console
 
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.look.cost import with_known_costs
 from levelproof.pipeline.outlet import has_reader
+from levelproof.pipeline.read.levels import with_known_costs
 from levelproof.pipeline.read.select import columns_in, ids_by, select
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.columns import COLUMNS

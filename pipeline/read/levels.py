@@ -24,6 +24,7 @@ from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 from levelproof.pipeline.store.origins import ASKED, origin_of
 from levelproof.pipeline.store.seed.file import is_seed
+from levelproof.pipeline.store.seed.rows import COSTS
 from levelproof.pipeline.store.seed.shard import stored_levels
 from levelproof.pipeline.words import many
 
@@ -47,6 +48,15 @@ def find_level(split: Path, level_id: int) -> tuple[Manifest, dict[str, Any]]:
             f"There is no level {level_id} in {split}: it has {many(len(ids), 'level')}, from {ids[0]} to {ids[-1]}."
         )
     return manifest, manifest.table.to_pylist()[0]
+
+
+def with_known_costs(manifest: Manifest) -> pa.Table:
+    """Return the manifest's rows, with null for costs that seeds left out: they are read as 0."""
+    rows = manifest.table
+    for name in COSTS if manifest.repeats else ():
+        if (at := rows.schema.get_field_index(name)) >= 0:
+            rows = rows.set_column(at, rows.field(at).with_nullable(True), pa.nulls(rows.num_rows, rows.field(at).type))
+    return rows
 
 
 def levels_of(manifest: Manifest, rows: pa.Table, in_command: bool = True) -> Level:

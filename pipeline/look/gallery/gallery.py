@@ -28,7 +28,7 @@ from levelproof.pipeline.look.gallery.attempts import FAILS, SOLVES, Contender, 
 from levelproof.pipeline.look.gallery.pages import PAGE, encode_columns, encode_page
 from levelproof.pipeline.look.gallery.worlds import drawn_bodies, encode_array, states_of, world_of
 from levelproof.pipeline.look.spread import spread
-from levelproof.pipeline.read.levels import levels_of, rules_of
+from levelproof.pipeline.read.levels import levels_of, rules_of, with_known_costs
 from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.read.select import columns_in, select
@@ -111,7 +111,7 @@ def _chosen(split: Path, where: str | None, most: int) -> tuple[Manifest, int]:
     if not len(ids):
         raise UserError(f"No level of {split} matches {where}: choose others with --where.")
     chosen = require_manifest(split, level_ids=ids[spread(len(ids), most)])
-    return replace(chosen, table=cost.with_known_costs(chosen)), len(ids)
+    return replace(chosen, table=with_known_costs(chosen)), len(ids)
 
 
 def _contender(policy: Path, manifest: Manifest) -> Contender:

@@ -37,9 +37,8 @@ MADE_FROM: dict[str, tuple[str, ...]] = {
     "row": ("label",),
     **dict.fromkeys(("versions", "engine", "device"), ("made_with",)),
 }
-# Left out of seed files: 0 when read
 MANY = 20_000  # levels that take a while to hash
-COSTS = ("env_steps", "evaluation_steps", "scout_steps", "search_steps", "episodes")
+COSTS = ("env_steps", "evaluation_steps", "scout_steps", "search_steps", "episodes")  # left out: 0 when read
 Each = Callable[[pa.Table], pa.Table]
 
 

@@ -16,7 +16,8 @@ from levelproof.pipeline.store.columns import COLUMNS
 from levelproof.pipeline.store.formats import CONFIG_KEY
 from levelproof.pipeline.store.layout import MANIFEST
 from levelproof.pipeline.store.manifest import read_manifest
-from tests.pipeline.made import PLAYED, made_job
+from levelproof.pipeline.store.seed.rows import COSTS
+from tests.pipeline.made import PLAYED, honest_split, made_job
 
 
 def test_export_parquet_keeps_rows_and_worlds(split: Path, tmp_path: Path, capsys, monkeypatch) -> None:
@@ -47,6 +48,14 @@ def test_export_parquet_keeps_rows_and_worlds(split: Path, tmp_path: Path, capsy
     query = f"SELECT level_id FROM '{tmp_path}/levels/*.parquet' WHERE list_contains(role, 3) ORDER BY ALL"
     red = np.flatnonzero((np.asarray(made.role) == 3).any(0))
     assert [row[0] for row in duckdb.sql(query).fetchall()] == red.tolist()
+
+
+def test_export_parquet_of_seeds_has_no_costs(tmp_path: Path) -> None:
+    split, seed, out = honest_split(tmp_path, 16, 1), tmp_path / "seed.parquet", tmp_path / "levels"
+    assert main(["export", str(split), "--format", "seed", "-o", str(seed)]) == 0
+    assert main(["export", str(seed), "--format", "parquet", "-o", str(out)]) == 0
+    table = pq.read_table(out)
+    assert all(table[name].null_count == table.num_rows == 16 for name in COSTS)
 
 
 def test_export_parquet_selects_levels_by_where(split: Path, tmp_path: Path, capsys) -> None:
