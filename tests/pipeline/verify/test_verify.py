@@ -213,6 +213,12 @@ def test_examine_finds_exchanged_identities(split: Path) -> None:
     assert_reported(split, *sorted(sentence.format(row["level_id"]) for row in (a, b)))
 
 
+def test_examine_finds_a_content_hash_that_only_a_gpus_row_claims(split: Path) -> None:
+    a, _ = neighbours(split)
+    forge(split, lambda row: row.update(content_hash=f"c1:{'0' * 32}") or set_a_gpu(row), [a["level_id"]])
+    assert_reported(split, f"Level {a['level_id']} has a world in its shard that differs from its content hash")
+
+
 def test_examine_finds_other_false_columns(split: Path) -> None:
     solved, trivial, unsolved = (
         rows_labelled(split, label)[0] for label in (Label.SOLVED, Label.TRIVIAL, Label.UNSOLVED)
