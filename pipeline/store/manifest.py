@@ -125,12 +125,14 @@ def fragment_paths(split: Path) -> list[Path]:
     return sorted(entries(split, MANIFEST, FRAGMENT, DirEntry.is_file))
 
 
-def write_index(split: Path) -> None:
-    """List the fragments in a file, for readers of web servers, which do not list files.
+def index_of(split: Path) -> bytes:
+    """Return the content of the file that lists the fragments, for readers of web servers, which do not list files."""
+    return "".join(f"{path.name}\n" for path in fragment_paths(split)).encode()
 
-    Raises: as `files.write`.
-    """
-    files.write(split / MANIFEST / INDEX, "".join(f"{path.name}\n" for path in fragment_paths(split)).encode())
+
+def write_index(split: Path) -> None:
+    """Write that file durably. Raises: as `files.write`."""
+    files.write(split / MANIFEST / INDEX, index_of(split), durable=True)
 
 
 def any_within(ordered: np.ndarray, first: int, last: int) -> bool:

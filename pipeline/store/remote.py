@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from urllib.parse import unquote
 
-from levelproof.pipeline.errors import UserError
+from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.runtime import cache_folder
 from levelproof.pipeline.store import hub
 from levelproof.pipeline.store.pieces import PieceCache
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 INDEX = "index.txt"  # in the manifest's folder: names of the fragments, for servers that do not list
 MAX_INDEX = 2**25  # bytes of it; a name takes 34
+FRAGMENT_NAME = re.compile(r"[0-9]{12}-[0-9]{12}\.parquet")
 PIECE = 2**20  # bytes; with 4 MB, random reads of 10 kB trajectories would fetch four times as much
 MAX_PIECES = 8  # adjacent pieces that one request fetches
 CONTROL = re.compile(r"[\x00-\x1f\x7f]")  # characters that no key may have
@@ -150,6 +151,7 @@ def fragments_in(folder: Path) -> dict[Path, Stored]:
 
     Raises:
         UserError, StoreFailure: as `stored_in`; or a web server has no index.
+        Failure: its index is damaged.
     """
     for known in list(_known):
         if folder.parent in known.parents:
@@ -165,7 +167,13 @@ def fragments_in(folder: Path) -> dict[Path, Stored]:
             f"There is no split at {as_typed(folder.parent)}, or it has no index: a split on a web "
             f"server needs {folder.name}/{INDEX}, which `levelproof seal` writes."
         ) from None
-    return {folder / name: Stored("", 0) for name in text.decode(errors="replace").split() if "/" not in name}
+    names = text.decode(errors="replace").split()
+    if wrong := [name for name in names if not FRAGMENT_NAME.fullmatch(name)]:
+        raise Failure(
+            f"The index {as_typed(folder / INDEX)} is damaged, because {wrong[0][:80]!r} names no fragment: run "
+            "`levelproof seal` on the split's folder, and upload it again."
+        )
+    return {folder / name: Stored("", 0) for name in names}
 
 
 def bytes_of(path: Path, most: int = MAX_WHOLE) -> bytes:

@@ -34,6 +34,7 @@ from levelproof.pipeline.store.job_note import JobNote, sound_note
 from levelproof.pipeline.store.layout import (
     BEGUN,
     EXPERTS,
+    INDEX_FILE,
     JOB,
     MANIFEST,
     attempt_of,
@@ -51,6 +52,7 @@ from levelproof.pipeline.store.manifest import (
     changes_text,
     differences,
     fragment_paths,
+    index_of,
     read_fragment,
     require_manifest,
 )
@@ -163,6 +165,8 @@ def _summed(split: Path, groups: Sequence[FragmentGroup], console: Console | Non
     say = lambda text: console and console.print(text, highlight=False, markup=False, soft_wrap=True)
     running = not complete or is_written(split, say)
     _find_lost_levels(split, note, present, named, running, findings)
+    if not running:
+        _check_index(split, findings)
     if note and not running:
         missing = without(without(note.level_ids.tolist(), present), np.array(sorted(findings.lost), np.int64))
         if missing:
@@ -182,6 +186,14 @@ def _note(split: Path, findings: Findings) -> JobNote | None:
             f"The file {split / JOB} is missing or damaged: the levels that the last command requested are unknown.", []
         )
     return note
+
+
+def _check_index(split: Path, findings: Findings) -> None:
+    """Compare the index for readers of web servers, if there is one here, with the fragments that are there."""
+    wanted = index_of(split)
+    for path in [] if is_remote(split) else entries(split, MANIFEST, INDEX_FILE, DirEntry.is_file):
+        if path.stat().st_size != len(wanted) or path.read_bytes() != wanted:
+            findings.add(f"The index {path} differs from the fragments there: `levelproof seal` writes it anew.", [])
 
 
 def _rows_in(path: Path) -> int:

@@ -343,7 +343,7 @@ def listings(folder: Path) -> Target:
         {"type": "file", "oid": "0123", "size": 77, "path": "1M/s/manifest/000000000000-000000000001.parquet"},
         {"type": "directory", "oid": "0124", "size": 0, "path": "1M/s/manifest"},
     ]
-    index = b"000000000000-000000000001.parquet\n000000000002-000000000003.parquet\nindex.txt\n"
+    index = b"000000000000-000000000001.parquet\n000000000002-000000000003.parquet\n"
 
     class FakeResponse:
         def __init__(self, data: bytes) -> None:

@@ -476,6 +476,18 @@ def test_revision_of_the_hub_with_a_slash_is_quoted_once(
         require_same(Path("hf://datasets/user/name@refs%2Fpr%2F1/1M/s"), split)
 
 
+def test_damaged_index_of_a_web_server_is_refused(split: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(split, tmp_path / "s"))
+    write_index(folder)
+    index = folder / MANIFEST / "index.txt"
+    whole = index.read_bytes()
+    with serving(files_of(tmp_path)) as server:
+        for damaged in whole[:-20], whole.replace(b"-", b"_", 1), whole.replace(b"\n", b"/", 1), b"x" + whole:
+            index.write_bytes(damaged)
+            with pytest.raises(Failure, match=r"s/manifest/index.txt is damaged, because '.*' names no fragment"):
+                read_manifest(Path(f"{server.url}/s"))
+
+
 def test_index_for_web_servers_follows_the_split(split: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(split, tmp_path / "s"))
     index, (gone, *_) = folder / MANIFEST / "index.txt", fragment_paths(folder)

@@ -27,6 +27,7 @@ from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.layout import JOB, MANIFEST, fragment_files, unit_name
 from levelproof.pipeline.store.locks import only_writer
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, write_index
+from levelproof.pipeline.store.remote import INDEX
 from levelproof.pipeline.store.seal import Piece, seal
 from levelproof.pipeline.store.shard import Shard, write_shard
 from levelproof.pipeline.verify import evidence
@@ -96,6 +97,18 @@ def test_examine_checks_a_split_on_a_web_server(split: Path, tmp_path: Path, mon
             file.write(" ")
         (sentence,) = examine(Path(f"{server.url}/{split.name}")).sentences
         assert f"{shard.name}/zarr.json is not what was committed" in sentence
+
+
+def test_examine_compares_the_index_for_web_servers_with_the_fragments(split: Path) -> None:
+    write_index(split)
+    index = split / MANIFEST / INDEX
+    whole = index.read_bytes()
+    cut = whole[: whole.index(b"\n") + 1]
+    for content, differs in (whole, False), (cut, True), (whole.replace(b"1", b"2", 1), True):
+        index.write_bytes(content)
+        verifying._check_index(split, findings := Findings())
+        assert bool(findings.wrong) == differs
+    assert_reported(split, f"The index {index} differs from the fragments there: `levelproof seal` writes it anew")
 
 
 def test_examine_reports_a_failing_server_as_such_and_not_as_damage(
