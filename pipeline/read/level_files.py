@@ -14,7 +14,7 @@ from levelproof.experts.networks.saved import CONFIG, WEIGHTS
 from levelproof.levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
 from levelproof.levelgen.identity.content import content_hashes, level_id_for
 from levelproof.levelgen.level import Level, concatenate_levels, name_of, size_of
-from levelproof.levelgen.task.rules import DEFAULT_RULES
+from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.read.kinetix.folder import open_folder, read_trajectories
 from levelproof.pipeline.read.kinetix.zarr2 import FormatError
@@ -124,8 +124,13 @@ def _other_rules(file: LevelFile, job: JobConfig) -> list[str]:
     """
     padding = job.task.physics.faithful_padding
     theirs = replace(file.rules, physics=replace(file.rules.physics, faithful_padding=padding))
-    ours = flat(plain(job.task))
-    return [f"task.{name}={value}" for name, value in flat(plain(theirs)).items() if value != ours[name]]
+    return rule_settings(theirs, job.task)
+
+
+def rule_settings(rules: TaskParams, others: TaskParams = DEFAULT_RULES) -> list[str]:
+    """Return the settings, NAME=VALUE, in which rules differ from others."""
+    known = flat(plain(others))
+    return [f"task.{name}={value}" for name, value in flat(plain(rules)).items() if value != known[name]]
 
 
 def levels_at(origins: Sequence[Origin]) -> Level:

@@ -18,6 +18,7 @@ from levelproof.levelgen.task.observe.flat import LIMIT, feature_count
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.exchange.minari.episodes import BLOCK, ActionKind, Episode, episodes_of
+from levelproof.pipeline.read.level_files import rule_settings
 from levelproof.pipeline.read.levels import rules_of
 from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.read.select import SOLVED, select_witnessed
@@ -52,6 +53,7 @@ def export_minari(split: Path, where: str | None, out: Path, kind: ActionKind = 
     prepare_jax()
     rows = select_witnessed(split, where or SOLVED)
     rules = rules_of(require_manifest(split, [], [rows.column("level_id")[0].as_py()]))
+    own = f"The rules differ from the defaults: {' '.join(other)}. " if (other := rule_settings(rules)) else ""
     budget, size = (rows.column(name)[0].as_py() for name in ("budget", "size"))
     name = size if kind == ActionKind.MULTI_DISCRETE else f"{size}-{kind}"
     dataset_id = f"{NAMESPACE}/{budget.replace('.', '_')}/{name}-v0"  # Minari's names have no dots
@@ -69,10 +71,12 @@ def export_minari(split: Path, where: str | None, out: Path, kind: ActionKind = 
                 "author": {f"levelproof {__version__}"},
                 "algorithm_name": "PPO experts of one level each, random play and search; replayed",
                 "description": f"Witnesses of {many(rows.num_rows, 'level')} of size {size}, made with a budget of "
-                f"{budget} env steps per level. infos has success, level_id, and which entries of an action do "
-                "something. " + (f"Six entries of an action: {UNRAVEL}" if kind == ActionKind.COMBINED else ""),
+                f"{budget} env steps per level. {own}infos has success, level_id, and which entries of an action "
+                "do something. " + (f"Six entries of an action: {UNRAVEL}" if kind == ActionKind.COMBINED else ""),
             }
         )
+    if own:
+        print(own.rstrip())
     print(
         f"{out}: {many(episodes, 'episode')} of {many(rows.num_rows, 'level')}, {many(steps, 'step')}.\n"
         f'Next:  MINARI_DATASETS_PATH={quoted(out)} and, in Python, minari.load_dataset("{dataset_id}")'

@@ -38,7 +38,7 @@ def test_dtype_of_matches_the_step_size_of_the_reference(size: str) -> None:
 def test_export_kinetix_keeps_every_bit_of_a_record(split: Path, tmp_path: Path) -> None:
     done = here(["export", str(split), "--format", "kinetix", "-o", "new/k"], tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "new/k: 2 trajectories of" in done.stdout
+    assert done.stdout.startswith("new/k: 2 trajectories of")
     exported = trajectories_in(tmp_path / "new/k")
     rows = require_manifest(split).table.to_pylist()
     assert [row["label"] for row in rows] == [label for unit in UNITS for label in unit]
@@ -78,6 +78,12 @@ def test_export_kinetix_selects_levels_by_where(split: Path, tmp_path: Path) -> 
     assert_refused(here([*none, "label = 'unsolved'"], tmp_path), 2, "has a witness", "--where")
     assert_refused(here([*none, "labell = 1"], tmp_path), 2, "Cannot use the condition")
     assert not (tmp_path / "none").exists()
+
+
+def test_export_kinetix_names_rules_that_the_layout_does_not_hold(tmp_path: Path) -> None:
+    split = made_split(tmp_path / "data", UNITS, "task.frame_skip=4")
+    done = here(["export", str(split), "--format", "kinetix", "-o", "k"], tmp_path)
+    assert "the layout does not hold them: task.frame_skip=4." in done.stdout
 
 
 def test_export_kinetix_splits_trajectories_into_arrays_and_blocks(

@@ -133,9 +133,13 @@ def test_export_minari_rejects_invalid_arguments(
     assert not (tmp_path / "out").exists()
 
 
-def test_budget_with_a_decimal_point_gives_a_name_that_minari_opens(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_dataset_names_a_budget_with_a_decimal_point_and_its_rules(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
-    split = honest_split(tmp_path / "data", 8, 1, "budget=11.5M")
+    split = honest_split(tmp_path / "data", 8, 1, "budget=11.5M", "task.dense_reward_scale=0.5")
     assert split.parent.name == "11.5M"
-    assert export_and_load(split, tmp_path / "out", monkeypatch).id == "levelproof/11_5M/s-v0"
+    data = export_and_load(split, tmp_path / "out", monkeypatch)
+    assert data.id == "levelproof/11_5M/s-v0"
+    rules = "The rules differ from the defaults: task.dense_reward_scale=0.5."
+    assert capsys.readouterr().out.startswith(f"{rules}\n")
+    assert rules in data.storage.metadata["description"]
