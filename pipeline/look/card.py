@@ -23,7 +23,19 @@ from levelproof.levelgen.pictures.raster import sheet, write_png
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look.figures import draw_panels, draw_shares
 from levelproof.pipeline.look.preview import preview
-from levelproof.pipeline.look.readme import FIGURES, MARK, PREVIEW, RATES, SHEET, STEPS, CardOptions, SplitFacts, readme
+from levelproof.pipeline.look.readme import (
+    FIGURES,
+    IMPORTED,
+    MARK,
+    PREVIEW,
+    RANDOM,
+    RATES,
+    SHEET,
+    STEPS,
+    CardOptions,
+    SplitFacts,
+    readme,
+)
 from levelproof.pipeline.read.levels import distribution_of, writing_to
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.disk import NotRegular
@@ -168,15 +180,16 @@ def _facts(path: str, manifest: Manifest) -> SplitFacts:
         config_hash=manifest.config_hash or "",
         stored_as=", ".join(sorted(set[str]().union(*(fragment.densities for fragment in manifest.counting)))),
         made_with=_made_with(table),
+        whole=not manifest.repeats and distribution_of(manifest) is not None,
     )
 
 
 def _distribution(manifest: Manifest) -> str:
     distribution = distribution_of(manifest)
     if distribution is None:
-        return "imported" if (manifest.config or {})["distribution"] == FROM_RECORDS else "level files"
+        return IMPORTED if (manifest.config or {})["distribution"] == FROM_RECORDS else "level files"
     name, short = name_and_hash(distribution)
-    return f"random, `{name}`" if name else f"random, custom distribution (`{short}`)"
+    return f"{RANDOM}, `{name}`" if name else f"{RANDOM}, custom distribution (`{short}`)"
 
 
 def _made_with(table: pa.Table) -> list[str]:

@@ -2,6 +2,7 @@
 
 import datetime
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -23,6 +24,7 @@ CATEGORIES = (  # the hub's size categories, by exclusive upper bound
     (10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"),
     (10**8, "10M<n<100M"), (10**9, "100M<n<1B"), (10**10, "1B<n<10B"), (10**11, "10B<n<100B"), (10**12, "100B<n<1T"),
 )  # fmt: skip
+RANDOM, IMPORTED = "random", "imported"  # how descriptions of distributions begin
 TAGS = ["reinforcement-learning", "offline-rl", "imitation-learning", "physics", "procedural-generation", "jax"]
 TAGS += ["kinetix", "levelproof"]
 KINETIX = """\
@@ -66,6 +68,7 @@ class SplitFacts:
     config_hash: str
     stored_as: str  # densities, as settings name them
     made_with: Sequence[str]  # each stack of versions and device
+    whole: bool  # whether every level that was tried is known to have a row
 
     @property
     def subset(self) -> str:
@@ -94,14 +97,16 @@ def readme(name: str, splits: Sequence[SplitFacts], options: CardOptions, figure
     header = yaml.safe_dump(_header(name, splits, options), sort_keys=False, allow_unicode=True, width=120)
     total = sum(split.transitions for split in splits)
     witnesses = sum(split.witnesses for split in splits)
+    origin = "random " if all(split.distribution.startswith(RANDOM) for split in splits) else ""
+    rows = WHOLE if all(split.whole for split in splits) else PARTIAL
     sections = [
         f"---\n{header}---\n\n{MARK}",
         f"# {name}",
-        f"**{_short(total)} transitions that solve {_short(witnesses)} random physics levels, each proved by "
+        f"**{_short(total)} transitions that solve {_short(witnesses)} {origin}physics levels, each proved by "
         f"replay.** Made by {_link('levelproof', options.code)} {version}.",
         _picture(SHEET, figures, "Levels of this dataset at the moment their witness reaches the goal"),
         OVERVIEW.format(
-            tried=f"{sum(split.levels for split in splits):,}",
+            rows=rows.format(levels=f"{sum(split.levels for split in splits):,}"),
             costs="" if any(split.seeds for split in splits) else ", with its search, learning curve and costs",
         ),
         f"## Splits\n\nOne folder for each training budget and size, `{{budget}}/{{size}}`.\n\n{_sizes(splits)}",
@@ -133,6 +138,8 @@ def _header(name: str, splits: Sequence[SplitFacts], options: CardOptions) -> di
     }
 
 
+WHOLE = "**No level that was tried is left out.** The manifests have a row for each of {levels} levels, solved or not"
+PARTIAL = "**Every level has a label.** The manifests have a row for each of the {levels} levels in these files"
 OVERVIEW = """## What it is
 
 Tasks are those of [Kinetix](https://github.com/FLAIROx/Kinetix): in a 2D world of rigid bodies, make the **green** \
@@ -141,14 +148,13 @@ its own.
 
 - **Solved means replayed.** A level is `solved` only if replaying its actions from its initial state, through the \
 engine, reached the goal. `levelproof verify` repeats the replay on your machine.
-- **No level that was tried is left out.** The manifests have a row for each of {tried} levels, solved or not\
-{costs}; `trivial` and `unsolvable` levels have labels of their own, each with its reason.
+- {rows}{costs}; `trivial` and `unsolvable` levels have labels of their own, each with its reason.
 - **The whole world at every step**, stored or recomputed by the engine, bit for bit: draw it, observe it in any way, \
 or start an environment from it."""
 
 
 def _sizes(splits: Sequence[SplitFacts]) -> str:
-    head = ("split", "levels tried", "distinct levels", "with a witness", "transitions", "size on disk")
+    head = ("split", "levels", "distinct levels", "with a witness", "transitions", "size on disk")
     rows = [f"| {' | '.join(head)} | bytes per transition |", "|---" * (len(head) + 1) + "|"]
     for split in splits:
         each = f"{split.shard_bytes / split.transitions:.1f}" if split.transitions else "-"
@@ -196,13 +202,13 @@ or with the library `datasets`: `load_dataset("{repo}", "{split.subset}", split=
 
 
 SHARDED = f"""
-- `manifest/*.parquet`: a row for every level that was tried: `label` and `label_reason`, `steps_to_goal`, success \
+- `manifest/*.parquet`: a row for every level: `label` and `label_reason`, `steps_to_goal`, success \
 rates, costs, `shard` and `row` of its data, and the command that remakes the row.
 - `shards/*.zarr`: zarr v3. A record of {RECORD_STEPS} steps for each level with a witness; the level restarts \
 whenever an episode ends. The split's density says how much of a record is stored; reading returns world, contacts, \
 action, reward, end and goal at any density. One trajectory is one compressed chunk with a checksum."""
 SEEDED = """
-- Seed files (`*.parquet`): a row for every level that was tried: its id, `label`, `steps_to_goal`, success rates, \
+- Seed files (`*.parquet`): a row for every level: its id, `label`, `steps_to_goal`, success rates, \
 and the actions of its first episode that reached the goal, packed into some ten bytes. levelproof makes the level \
 from its id and plays the actions when the row is read; a checksum tells whether the states are the original ones. \
 Costs and learning curves are not in them."""
@@ -223,13 +229,15 @@ def _making(splits: Sequence[SplitFacts]) -> str:
     for split in splits:
         cells = f"{split.budget} | {split.distribution} | `{split.config_hash}` | `{split.stored_as}`"
         rows.append(f"| `{split.path}` | {cells} | {'; '.join(split.made_with)} |")
-    first = splits[0]
+    first = next((split for split in splits if split.distribution != IMPORTED), splits[0])
+    aim, commands = "check every byte and every witness", [["verify", f"data/{first.path}"]]
+    if first.distribution != IMPORTED:  # whose labels are of another program's actions
+        aim = f"remake the levels and their labels, or to {aim}"
+        commands.insert(0, ["regenerate", f"manifest=data/{first.path}", f"budget={first.budget}", "out=again"])
     return (
         f"## How it was made\n\n{_procedure(splits)} The manifest's column `witness` (`source` in seed files) says "
         "where each solution came from. The manifests contain the whole configuration.\n\n" + "\n".join(rows) + "\n\n"
-        "To remake the levels and their labels, or to check every byte and every witness:\n\n"
-        f"    levelproof regenerate manifest=data/{first.path} budget={first.budget} out=again\n"
-        f"    levelproof verify data/{first.path}"
+        f"To {aim}:\n\n" + "\n".join(f"    levelproof {shlex.join(words)}" for words in commands)
     )
 
 

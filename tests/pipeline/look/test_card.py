@@ -3,6 +3,7 @@
 import io
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from shutil import copyfile
 from typing import Any
@@ -24,6 +25,10 @@ from levelproof.pipeline.look.readme import MARK, CardOptions, SplitFacts, readm
 from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.made import made_split, played_split
 from tests.pipeline.planted import PLANTED, no_hang
+
+FACTS = SplitFacts(
+    "1M/s", False, "", {"solved": 2}, 2, 2, 2, np.arange(0), 0, 0, "1M", "random", True, True, "", "", [], True
+)
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +76,7 @@ def test_card_of_seed_files_names_what_is_there(tmp_path: Path, monkeypatch: pyt
             assert re.fullmatch(r"\w+", entry["split"])
             assert [*tmp_path.glob(entry["path"])], entry
     assert ".zarr" not in text
+    assert "No level that was tried is left out" not in text, "seed files may be of some levels only"
     shown = pq.read_table(next((tmp_path / "preview").iterdir()))
     assert shown["env_steps"].null_count == 4, "seeds leave costs out"
     steps = np.nansum(read_manifest(seeds).table["steps_to_goal"].to_numpy())
@@ -155,22 +161,14 @@ def test_card_counts_each_split_once_and_refuses_equal_subsets(dataset: Path, mo
 
 @pytest.mark.parametrize(("witnesses", "words"), [(0, "n<1K"), (3, "n<1K"), (4, "1K<n<10K"), (6 * 10**6, "1B<n<10B")])
 def test_size_category_counts_transitions(witnesses: int, words: str) -> None:
-    facts = SplitFacts(
-        "1M/s", False, "", {"solved": witnesses}, witnesses, witnesses, 256 * witnesses, np.arange(0), 0, 0, "1M", "",
-        True, True, "", "", [],
-    )  # fmt: skip
+    facts = replace(FACTS, transitions=256 * witnesses)
     header = readme("name", [facts], CardOptions(), [], "0.1.0").split("---\n")[1]
     assert yaml.safe_load(header)["size_categories"] == [words]
 
 
 def test_card_tells_which_splits_had_experts() -> None:
     def text(*trained: bool, searched: bool = True) -> str:
-        facts = [
-            SplitFacts(
-                f"1M/{i}", False, "", {"solved": 1}, 1, 1, 1, np.arange(0), 0, 0, "1M", "", searched, each, "", "", []
-            )
-            for i, each in enumerate(trained)
-        ]
+        facts = [replace(FACTS, path=f"1M/{i}", searched=searched, experts=each) for i, each in enumerate(trained)]
         return readme("name", facts, CardOptions(), [], "0.1.0")
 
     assert "Levels were searched for a way to the goal, as configured. No experts were trained." in text(False, False)
@@ -179,6 +177,19 @@ def test_card_tells_which_splits_had_experts() -> None:
     assert "were searched" not in (published := text(True, searched=False))
     assert "Levels had PPO experts of their own" in published
     assert "experts" not in text(False, searched=False).partition("## How it was made")[2].partition("## Lic")[0]
+
+
+@pytest.mark.parametrize(
+    ("distribution", "whole"), [("random, `kinetix`", True), ("random, `kinetix`", False), ("imported", False)]
+)
+def test_card_claims_only_what_is_known(distribution: str, whole: bool) -> None:
+    facts = replace(FACTS, path="my 1M/s", distribution=distribution, whole=whole)
+    text = readme("name", [facts], CardOptions(), [], "0.1.0")
+    assert ("solve 2 random physics levels" in text) == distribution.startswith("random")
+    assert ("No level that was tried is left out" in text) == whole
+    assert ("a row for each of the 2 levels in these files" in text) == (not whole)
+    assert ("levelproof regenerate 'manifest=data/my 1M/s' budget=1M" in text) == distribution.startswith("random")
+    assert "levelproof verify 'data/my 1M/s'" in text
 
 
 def test_share_interval_is_wilsons() -> None:
