@@ -392,7 +392,7 @@ def test_read_stops_at_the_maximum_size(tmp_path: Path, monkeypatch: pytest.Monk
 def test_read_explains_wrong_sizes_from_a_server() -> None:
     def answers(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
         if path.endswith("index.txt"):
-            return Answer(200, {}, b"000000000000-000000000001.parquet\n../../x.parquet\n")
+            return Answer(200, {}, b"000000000000-000000000001.parquet\n")
         return Answer(200, {"Content-Length": str(2**60)} if method == "HEAD" else {}, b"")
 
     with serving(answers) as server, pytest.raises(Failure, match=r"parquet is damaged"):
@@ -482,7 +482,8 @@ def test_damaged_index_of_a_web_server_is_refused(split: Path, tmp_path: Path) -
     index = folder / MANIFEST / "index.txt"
     whole = index.read_bytes()
     with serving(files_of(tmp_path)) as server:
-        for damaged in whole[:-20], whole.replace(b"-", b"_", 1), whole.replace(b"\n", b"/", 1), b"x" + whole:
+        changed = whole.replace(b"-", b"_", 1), whole.replace(b"\n", b"/", 1), whole + b"../../x.parquet"
+        for damaged in whole[:-20], *changed:
             index.write_bytes(damaged)
             with pytest.raises(Failure, match=r"s/manifest/index.txt is damaged, because '.*' names no fragment"):
                 read_manifest(Path(f"{server.url}/s"))
