@@ -137,7 +137,7 @@ def _fetch(folder: Path) -> None:
         reasons.append((done.stderr.strip().splitlines() or ["no message"])[-1])
     raise UserError(
         f"Cannot fetch the handmade levels ({'; '.join(reasons)}): run `pip download --no-deps {PACKAGE}` on another "
-        "machine, unzip the file, and name its folder kinetix/levels instead of {HANDMADE}."
+        f"machine, unzip the file, and name its folder kinetix/levels instead of {HANDMADE}."
     )
 
 
