@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from levelproof.physics.block import Block, Inputs, Scratch
+from levelproof.physics.bounds import require_32_bits
 from levelproof.physics.buffers import buffers_like, buffers_of
 from levelproof.physics.codegen.call import Compiled, Kernel, by_platform, compiled_once, require_fit
 from levelproof.physics.engine import STAGES, Stage, step_block
@@ -44,13 +45,15 @@ def step(
         The worlds after the step, and the contacts found at its start: a Manifold, or None unless `with_contacts`.
 
     Raises:
-        ValueError: an array's shape differs from its annotation for the model's size.
+        ValueError: an array's shape differs from its annotation for the model's size; or `jax_enable_x64` is on, and
+            the states are float32.
         TypeError: an array's dtype differs from its annotation.
         NotImplementedError: the CPU is neither x86-64 nor AArch64.
     """
     inputs = Inputs(model, state, motor, thrust)
     if jax.dtypes.canonicalize_dtype(state.position.dtype) != jnp.float32:
         return on_all_lanes(inputs, params, with_contacts)
+    require_32_bits()
     return by_platform(
         lambda inputs: as_machine_code(inputs, params, with_contacts),
         lambda inputs: on_all_lanes(inputs, params, with_contacts),

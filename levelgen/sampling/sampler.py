@@ -140,6 +140,7 @@ def sample_chunk(level_ids: Int[Array, " lane"], size: Size, distribution: Distr
 
 def sample(level_ids: Int[Array, " lane"], size: Size, distribution: Distribution) -> Level:
     """Sample the levels with these ids, 0 .. MAX_LEVEL_ID, within `jax.jit`."""
+    require_32_bits()
     results = by_platform(
         lambda ids: _as_machine_code(ids, size, distribution),
         lambda ids: _on_all_lanes(ids, size, distribution),

@@ -70,3 +70,8 @@ def test_arrays_of_one_lane_broadcast() -> None:
     one = given._replace(model=jax.tree.map(lambda x: x[..., :1], given.model))
     after, _ = jax.eval_shape(lambda: step(*one))  # pyright: ignore[reportArgumentType]
     assert after.rotation.shape == (BODIES, LANES)
+
+
+def test_step_refuses_64_bit_mode() -> None:
+    with jax.enable_x64(True), pytest.raises(ValueError, match="jax_enable_x64 is on"):
+        jax.eval_shape(step, *world())
