@@ -53,8 +53,14 @@ class Kernel:
             self.body(*jax.tree.map(jax.new_ref, arrays))
 
         # Under `jax.shard_map`, JAX would add equations that move arrays between the mesh's devices. Under
-        # `jax.disable_jit`, loops would be unrolled, and the long code be kept for other processes.
-        with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())), jax.disable_jit(False):
+        # `jax.disable_jit`, loops would be unrolled, and the long code be kept for other processes. The strict modes
+        # of promotion refuse the kernels' code.
+        with (
+            jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())),
+            jax.disable_jit(False),
+            jax.numpy_dtype_promotion("standard"),
+            jax.numpy_rank_promotion("allow"),
+        ):
             return jax.make_jaxpr(kernel)(*jax.tree.map(Buffer.array, self.buffers))
 
     def compiled(self, request: str, sources: Sequence[Path]) -> "Compiled":

@@ -58,8 +58,9 @@ def seed_parts(
         rows = rows.append_column("row", pa.array(_positions(path, rows, about), pa.int32()))
         if level_ids is not None:
             rows = rows.filter(np.isin(rows.column("level_id").to_numpy(), level_ids))
+        identities = _identities(about, rows) if {*IDENTITIES} & {*names} and rows.num_rows else {}
         try:
-            table = manifest_rows(about, rows, names, compact)
+            table = manifest_rows(about, rows, identities, names, compact)
         except DAMAGE as error:  # of settings and of `made_with`, which are JSON
             raise damaged_seed(path, error) from error
         parts.append((about.fragment, table if each is None else each(table)))
@@ -74,12 +75,13 @@ def _positions(path: Path, rows: pa.Table, about: SeedFile) -> np.ndarray:
     return np.searchsorted(all_ids, rows.column("level_id").to_numpy())
 
 
-def manifest_rows(about: SeedFile, rows: pa.Table, names: Sequence[str], compact: bool) -> pa.Table:
-    """Make columns of the manifest from rows of a seed file (with `row`, their positions)."""
+def manifest_rows(
+    about: SeedFile, rows: pa.Table, identities: Mapping[str, pa.Array], names: Sequence[str], compact: bool
+) -> pa.Table:
+    """Make columns of the manifest from rows of a seed file (with `row`, their positions) and their `_identities`."""
     config, schema = about.fragment.config, schema_of(names, compact)
     if not rows.num_rows:
         return schema.empty_table()
-    identities = _identities(about, rows) if {*IDENTITIES} & {*names} else {}
     columns = []
     for field in schema:
         name = field.name

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -23,7 +23,6 @@ from levelproof.pipeline.store.seed.packed import unpack_witnesses
 from levelproof.pipeline.store.seed.source import LevelSource
 from levelproof.pipeline.store.shard import Part, Shard
 
-T = TypeVar("T")
 COLUMNS = ("label", "steps_to_goal", "witness", "checksum")
 RECORD = "record/"
 
@@ -91,7 +90,8 @@ class SeedShard(Shard):
         """Make the levels of these rows: numpy arrays, level axis last.
 
         Raises:
-            ValueError: their content is missing or invalid.
+            UserError: the file was written without its levels.
+            Failure: their content is invalid.
         """
         sampled = self._source.distribution is not None
         content = [] if sampled else self._content.take(pa.array(rows, pa.int64())).to_pylist()
@@ -101,12 +101,15 @@ class SeedShard(Shard):
         """Unpack the actions of the first episodes of these rows, [256, 6, level]; zeros after their ends.
 
         Raises:
-            ValueError: they are invalid, or a row has none.
+            Failure: they are invalid, or a row has none.
         """
         packed = self.witness.take(pa.array(rows, pa.int64())).to_pylist()
-        if None in packed:
-            raise ValueError("it has no witness for a level that should have one")
-        return unpack_witnesses(packed, self.steps[np.asarray(rows)])
+        try:
+            if None in packed:
+                raise ValueError("it has no witness for a level that should have one")
+            return unpack_witnesses(packed, self.steps[np.asarray(rows)])
+        except ValueError as error:
+            raise damaged_seed(self.path, error) from error
 
     def restore(self, parts: Sequence[Part], table: Sequence[FieldSpec], places: Sequence[Sequence[int]]) -> Restored:
         """Simulate rows of seed files. Raises as `Shard.restore`."""
@@ -136,10 +139,7 @@ def stored_levels(source: Path, level_ids: np.ndarray) -> Level:
         about, rows = read_seed(path, ["content"], np.sort(level_ids))
         config = about.fragment.config
         contents |= dict(zip(rows.column("level_id").to_pylist(), rows.column("content").to_pylist(), strict=True))
-    try:
-        return LevelSource.of(config or {}, source).levels(level_ids, [contents.get(i) for i in level_ids.tolist()])
-    except ValueError as error:
-        raise damaged_seed(source, error) from error
+    return LevelSource.of(config or {}, source).levels(level_ids, [contents.get(i) for i in level_ids.tolist()])
 
 
 def play_seeds(
@@ -165,7 +165,7 @@ def play_seeds(
         _joined([getattr(shard, name)[np.asarray(rows)] for shard, rows in parts], order)
         for name in ("steps", "checksum")
     )
-    action = _joined(_each(parts, SeedShard.actions), order)
+    action = _joined([shard.actions(rows) for shard, rows in parts], order)
     wanted = frozenset(name.removeprefix(RECORD) for name in names if name.startswith(RECORD))
     made = play_episodes(level, action, steps, parts[0][0].encoding.rules, wanted, observation)
     rows = {f"{RECORD}{name}": x for name, x in made.fields.items()}
@@ -179,18 +179,7 @@ def play_seeds(
 
 def _levels(parts: Sequence[SeedPart], order: np.ndarray | None) -> Level:
     """Make the levels of rows, level axis last."""
-    return jax.tree.map(lambda *xs: _joined(xs, order), *_each(parts, SeedShard.levels))
-
-
-def _each(parts: Sequence[SeedPart], make: Callable[[SeedShard, Sequence[int]], T]) -> list[T]:
-    """Apply `make` to the rows of each file. Raise Failure for the file whose rows are invalid."""
-    made = []
-    for shard, rows in parts:
-        try:
-            made.append(make(shard, rows))
-        except ValueError as error:
-            raise damaged_seed(shard.path, error) from error
-    return made
+    return jax.tree.map(lambda *xs: _joined(xs, order), *[shard.levels(rows) for shard, rows in parts])
 
 
 def _order(places: Sequence[Sequence[int]]) -> np.ndarray | None:

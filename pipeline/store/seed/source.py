@@ -19,6 +19,7 @@ from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.types import Size
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.store.formats import FIRST_VERSION
+from levelproof.pipeline.store.seed.file import damaged_seed
 from levelproof.pipeline.store.seed.worlds import unpack_worlds
 from levelproof.pipeline.urls import as_typed, quoted
 
@@ -91,12 +92,15 @@ class LevelSource:
 
         Raises:
             UserError: the file was written without its levels.
-            ValueError: a content is invalid.
+            Failure: a content is invalid.
         """
         if self.distribution is None:
             if any(one is None for one in content):
                 raise without_levels(self.path)
-            return unpack_worlds([one for one in content if one is not None], self.size)
+            try:
+                return unpack_worlds([one for one in content if one is not None], self.size)
+            except ValueError as error:
+                raise damaged_seed(self.path, error) from error
         ids = np.asarray(level_ids, np.int32)
         sampled = lambda some: sample_chunk(ids[some], self.size, self.distribution)
         with on_cpu():

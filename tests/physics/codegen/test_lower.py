@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from jax import lax
 from jax.extend import core, linear_util
 
+from levelproof.physics.codegen import call
 from levelproof.physics.codegen.buffers import LANES, Buffer
 from tests.physics.codegen.kernels import Kernel, rows, same_bits
 
@@ -202,3 +203,11 @@ class TestRefused:
         kernel = Kernel(write, [Buffer((4,)), Buffer((LANES,), "int32", lanes=False)], [Buffer((1,))])
         with pytest.raises(NotImplementedError, match=name):
             kernel.as_machine_code(np.zeros((4, LANES), np.float32), np.zeros(LANES, np.int32))
+
+
+def test_kernel_is_traced_under_standard_promotion() -> None:
+    def body(x, table, out, scratch):
+        out[...] = x[...] + x[0] * (x[0] > 0)
+
+    with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
+        assert call.Kernel(body, Buffer((4,)), (), Buffer((4,)), ()).trace().eqns

@@ -28,6 +28,7 @@ from levelproof.pipeline.exchange.seed import NAMED, _require_alike, export_seed
 from levelproof.pipeline.jobs.grow import _job, grow
 from levelproof.pipeline.jobs.grower import Grower, grow_unit
 from levelproof.pipeline.jobs.schedule import Order, WorkUnit
+from levelproof.pipeline.store.contents import table_for
 from levelproof.pipeline.store.fields import arrays_of
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.seed.columns import SCHEMA, WRITTEN
@@ -333,6 +334,14 @@ def test_the_file_with_an_invalid_row_is_named(seed: Path, tmp_path: Path) -> No
     parts = [(SeedShard(seed), solved), (SeedShard(other), unsolved)]
     with pytest.raises(Failure, match=f"{other} is damaged .it has no witness for a level that should have one"):
         play_seeds(parts, [[0], [1]], ["level/state/position"])
+
+
+def test_a_setting_of_jax_is_not_reported_as_damage(seed: Path) -> None:
+    shard = SeedShard(seed)
+    with jax.enable_x64(True):
+        for read in (lambda: shard.restore([(shard, [0])], table_for(shard.size), [[0]]), lambda: read_manifest(seed)):
+            with pytest.raises(ValueError, match="jax_enable_x64 is on"):
+                read()
 
 
 def test_grow_refuses_another_name_and_foreign_settings(seed: Path, tmp_path: Path) -> None:
