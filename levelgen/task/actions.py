@@ -29,8 +29,9 @@ def controls(level: Level, action: Int[Array, "6 lane"]) -> Controls:
 
     Raises:
         ValueError: the action has another shape.
+        TypeError: it has floats.
     """
-    _require_axes(action, ACTIONS)
+    _require_fit(action, False, ACTIONS)
     forward, backward = action[:MOTOR_BINDINGS] == 1, action[:MOTOR_BINDINGS] >= 2
     motor = forward.astype(jnp.float32) - backward.astype(jnp.float32)
     return _obeyed(level, motor, (action[MOTOR_BINDINGS:] != 0).astype(jnp.float32))
@@ -40,9 +41,9 @@ def discrete_controls(level: Level, action: Int[Array, " lane"]) -> Controls:
     """Convert a discrete action, a code below DISCRETE_ACTIONS, to controls.
 
     Codes 2k and 2k + 1 run the motors of entry k backward and forward, NOTHING does nothing, and NOTHING + 1 + k fires
-    the thrusters of entry k. Raises ValueError if the action has another shape.
+    the thrusters of entry k. Raises as `controls`.
     """
-    _require_axes(action)
+    _require_fit(action, False)
     is_code = lambda code: (action == code).astype(jnp.float32)
     motor = jnp.stack([is_code(2 * k + 1) - is_code(2 * k) for k in range(MOTOR_BINDINGS)])
     return _obeyed(level, motor, jnp.stack([is_code(NOTHING + 1 + k) for k in range(THRUSTER_BINDINGS)]))
@@ -53,16 +54,25 @@ def continuous_controls(level: Level, action: Float[Array, "6 lane"]) -> Control
 
     Raises:
         ValueError: the action has another shape.
+        TypeError: it has no floats.
     """
-    _require_axes(action, ACTIONS)
+    _require_fit(action, True, ACTIONS)
     return _obeyed(level, jnp.clip(action[:MOTOR_BINDINGS], -1.0, 1.0), jnp.clip(action[MOTOR_BINDINGS:], 0.0, 1.0))
 
 
-def _require_axes(action: Array, *entries: int) -> None:
-    """Raise ValueError if an action does not have these axes before its lanes: others would broadcast silently."""
+def _require_fit(action: Array, floats: bool, *entries: int) -> None:
+    """Check that an action has these axes before its lanes, and floats or not: others would mean other controls.
+
+    Raises:
+        ValueError: it has other axes.
+        TypeError: it has another type.
+    """
     if action.shape[:-1] != entries or not action.ndim:
         wanted = ", ".join([*map(str, entries), "lanes"])
         raise ValueError(f"actions have shape {action.shape}, but must have ({wanted}) for this action_type")
+    if jnp.issubdtype(action.dtype, jnp.floating) != floats:
+        wanted = "floats" if floats else "integers"
+        raise TypeError(f"actions are {action.dtype}, but must be {wanted} for this action_type: convert them")
 
 
 def _obeyed(level: Level, motor: Float[Array, "4 lane"], thrust: Float[Array, "2 lane"]) -> Controls:

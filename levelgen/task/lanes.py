@@ -130,6 +130,7 @@ class Lanes:
         Raises:
             ValueError: the action has another shape.
         """
+            TypeError: it has integers instead of floats, or floats instead of integers.
         env, level = self.env, played.level
         if action.shape[-1:] != state.level_index.shape:
             raise ValueError(f"actions have shape {action.shape}, but there are {len(state.level_index)} lanes")

@@ -289,6 +289,10 @@ def test_step_refuses_an_action_of_another_type(levels: Level) -> None:
         for step in env.step, env.step_env:
             with pytest.raises(ValueError, match=rf"an action has shape .*, but must be .* for action_type='{kind}'"):
                 jax.eval_shape(step, jax.random.key(0), state, jnp.zeros(wrong), params)
+            action = env.action_space(params).sample(jax.random.key(0))
+            other = action.astype(int if kind == "continuous" else float)
+            with pytest.raises(TypeError, match=rf"actions are {other.dtype}, but must be .* for this action_type"):
+                jax.eval_shape(step, jax.random.key(0), state, other, params)
 
 
 def test_make_refuses_no_levels(levels: Level) -> None:

@@ -65,6 +65,8 @@ def test_lanes_take_numpy_levels_and_refuse_actions_of_another_type(levels: Leve
     ):
         with pytest.raises(ValueError, match=f"actions have shape {words}"):
             step(jnp.zeros(shape, int))
+    with pytest.raises(TypeError, match="actions are float32, but must be integers"):
+        step(jnp.zeros((6, 3)))
     discrete = Lanes(make(levels, "discrete")[0])
     with pytest.raises(ValueError, match=r"but must have \(lanes\)"):
         jax.eval_shape(discrete.step, table, played, state, jnp.zeros((6, 3), int), jnp.arange(3))
