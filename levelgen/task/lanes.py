@@ -108,6 +108,7 @@ class Lanes:
 
     def reset(self, table: Table, level_index: Int[Array, " lane"]) -> tuple[Any, LaneState, LevelTable]:
         """Start an episode in every lane; return (observation, state, played)."""
+        level_index = jnp.asarray(level_index, jnp.int32)  # as in the states of `step`, so that scans can carry them
         columns = self._columns(table, level_index)
         played, state = replace(columns, start=None), LaneState(_start_of(columns), level_index)
         return self.observe(state, played), state, played
@@ -129,8 +130,8 @@ class Lanes:
 
         Raises:
             ValueError: the action has another shape.
-        """
             TypeError: it has integers instead of floats, or floats instead of integers.
+        """
         env, level = self.env, played.level
         if action.shape[-1:] != state.level_index.shape:
             raise ValueError(f"actions have shape {action.shape}, but there are {len(state.level_index)} lanes")

@@ -86,3 +86,11 @@ def test_lanes_observe_as_the_environment_does(levels: Level, kind: str) -> None
     shown = jax.eval_shape(lambda: lanes.reset(lanes.table(params), jnp.arange(2))[0])
     single = jax.eval_shape(lambda: env.reset(jax.random.key(0))[0])
     assert jax.tree.map(lambda x: (*x.shape, 2), single) == jax.tree.map(lambda x: x.shape, shown)
+
+
+def test_lanes_reset_to_a_state_of_the_types_that_step_returns(levels: Level) -> None:
+    lanes = Lanes(make(levels)[0])
+    table, index = lanes.table(), jnp.arange(3, dtype=jnp.uint32)
+    _, state, played = jax.eval_shape(lanes.reset, table, index)
+    _, after, *_ = jax.eval_shape(lanes.step, table, played, state, jnp.zeros((6, 3), int), index)
+    assert after == state
