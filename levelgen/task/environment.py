@@ -5,7 +5,8 @@ with `jax.vmap`; the mapped axis becomes the engine's lanes (`levelgen.vmapped`)
 resets: to a level drawn from `params.levels`, or to `override_reset_state`.
 
 The level that a reset draws depends on its key, the episode's number and a tag of its own. So callers that pass one
-key to `reset`, `step` and the sampling of actions, or the same key to every step, still meet every level.
+key to `reset`, `step` and the sampling of actions, or the same key to every step, still meet every level through
+automatic resets. Calls of `reset` with equal keys start the same level.
 Facts: `kinetix.environment.env` and `spaces` 3.0.2.
 """
 
