@@ -6,14 +6,15 @@ The task's own distance is between centres. It says little about a long floor, a
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from levelproof.levelgen.level import Level, Role
-from levelproof.physics.manifold import faces
-from levelproof.physics.types import MAX_VERTICES, Model, State
+from levelproof.physics.manifold import faces, may_touch
+from levelproof.physics.types import FIXED_POLYGONS, MAX_VERTICES, Model, State
 from levelproof.physics.vector import Vec, nonzero, select, vec
 
-MAX_PAIRS = 2  # pairs of a green and a blue body that are measured; sampled levels have one
+MAX_PAIRS = 2  # pairs of a green and a blue body that are measured, the first; sampled levels have one
 FAR = 1e6  # m, gap without a pair
 
 
@@ -26,7 +27,7 @@ class Shape(NamedTuple):
 
 
 class Goals(NamedTuple):
-    """Pairs of a green and a blue body."""
+    """Pairs of a green and a blue body that can touch."""
 
     green: Shape
     blue: Shape
@@ -35,9 +36,10 @@ class Goals(NamedTuple):
 
 def goals_of(level: Level) -> Goals:
     """Return the first pairs of each lane."""
-    role = jnp.where(level.model.active, level.role, Role.PLAIN)
-    bodies = len(role)
-    both = ((role[:, None] == Role.GREEN) & (role[None] == Role.BLUE)).reshape(bodies * bodies, -1)
+    bodies = len(level.role)
+    a, b = np.divmod(np.arange(bodies * bodies), bodies)
+    both = (level.role[a] == Role.GREEN) & (level.role[b] == Role.BLUE) & may_touch(level.model, a, b)
+    both &= (np.maximum(a, b) >= FIXED_POLYGONS)[:, None]  # scenery never touches scenery
     turn = jnp.where(both, jnp.cumsum(both, axis=0), 0)
     number = jnp.arange(bodies * bodies)[:, None]
     pair = jnp.stack([jnp.where(turn == 1 + k, number, 0).sum(0) for k in range(MAX_PAIRS)])

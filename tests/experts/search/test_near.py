@@ -61,6 +61,16 @@ def test_gap_is_that_of_the_nearest_pair() -> None:
     assert measured(level) == pytest.approx(1.5 - 0.1 - 0.6 - 0.2)
 
 
+def test_gap_leaves_out_pairs_that_cannot_touch() -> None:
+    """A green floor and a blue wall; a ball and a blue bar whose collision modes exclude each other."""
+    scenery, modes = goal_at(1), goal_at(BAR)
+    scenery.role[0], scenery.role[GOAL], scenery.role[BALL] = Role.GREEN, Role.BLUE, Role.PLAIN
+    modes.model.collision_mode[[BALL, BAR]], modes.role[GOAL] = [[1], [0]], Role.BLUE
+    expected = measured(switchback())[0]
+    assert measured(scenery)[0] > 1
+    assert measured(modes)[0] == pytest.approx(expected)
+
+
 def test_gap_without_a_pair_is_far() -> None:
     level = goal_at(BAR, role=Role.RED)
     assert measured(level) == pytest.approx(FAR)
