@@ -86,6 +86,7 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
         table = table_of(source.levels, recipe.rules)
         programs = programs_of(recipe, table, params, cores)
         fresh = programs.begin(table, params)
+        table, params = jax.device_put((table, params), fresh.updates.sharding)  # once, not in every update
         learner = jax.tree.map(lambda x, like: jax.device_put(x, like.sharding), continued(out, fresh), fresh)
         steps = int(learner.updates) * config.ppo.steps_per_update
         if int(learner.updates) > config.ppo.updates:

@@ -6,6 +6,7 @@ import signal
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
@@ -163,6 +164,16 @@ def continues_bit_for_bit(words: tuple[str, ...], tmp_path: Path, monkeypatch: p
         assert (out / name).read_bytes() == (whole / name).read_bytes()
     assert metrics(out)[-1]["train/return"] == metrics(whole)[-1]["train/return"]
     return out
+
+
+def test_levels_are_on_the_cores_before_the_first_update(
+    easy: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tables = list[Any]()
+    trains = lambda programs, learner, table, *_: tables.append(table) or learner
+    monkeypatch.setattr(module, "update_until_done", trains)
+    trained(tmp_path, 2, *easy)
+    assert {x.committed and x.sharding.is_fully_replicated for x in jax.tree.leaves(tables)} == {True}
 
 
 @pytest.mark.slow
