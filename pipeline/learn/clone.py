@@ -78,8 +78,10 @@ def clone(splits: Sequence[Path], config: CloneConfig, out: Path, console: Conso
         require_same_run(out, note)
         state = continued(out, begin_imitation(np.int32(config.seed), config.network, size, config.train))
         curves = COURSE if config.played else COURSE._replace(panels=COURSE.panels[:-1])
-        with recorded(out, note, curves, config.log, int(state.updates), policy_of, tell, require_ours) as run:
-            if int(state.updates) < config.train.updates:
+        updates = int(state.updates)
+        trains = updates < config.train.updates
+        with recorded(out, note, curves, config.log, updates, policy_of, tell, require_ours, trains) as run:
+            if trains:
                 state = train(sources, config, state, run, console)
             run.save(state)
     tell_done(out, config.network.only_size(size), tell)

@@ -110,7 +110,8 @@ def distill(split: Path, config: DistillConfig, out: Path, console: Console) -> 
         now = continued(out, fresh)
         now = now._replace(labels=jax.device_get(now.labels))
         updates = int(now.imitation.updates)
-        with recorded(out, note, COURSE, config.log, updates, policy_of, tell, require_ours) as run:
+        trains = updates < config.train.updates
+        with recorded(out, note, COURSE, config.log, updates, policy_of, tell, require_ours, trains) as run:
             now = update_until_done(taught, config, network, now, run, console)
             run.save(now)
     tell_done(out, network.only_size(size), tell)

@@ -86,17 +86,24 @@ def require_same_run(out: Path, note: dict[str, Any], free: Sequence[str] = ()) 
         raise UserError(f"{out} has a run with other settings or levels ({what}): repeat its command, or change -o.")
 
 
-def with_stack(out: Path, note: dict[str, Any], tell: Callable[[str], None]) -> dict[str, Any]:
-    """Return the note with the versions and devices that have trained the run in `out`, this machine's last.
-
-    Tells the user if other versions or another device trained it last: its bytes may then differ.
+def stacks_in(out: Path) -> list[dict[str, Any]]:
+    """Return the versions and devices that have trained the run in `out`, in turn; empty for a new run.
 
     Raises:
         Failure: the note is damaged.
     """
-    before, now = (note_in(out) or {}).get(MADE_BY, []), versions() | learned_with() | {"device": device()}
-    if not (isinstance(before, list) and all(isinstance(each, dict) for each in before)):
+    stacks = (note_in(out) or {}).get(MADE_BY, [])
+    if not (isinstance(stacks, list) and all(isinstance(each, dict) for each in stacks)):
         raise Failure(f"{out / RUN} is damaged ({MADE_BY}): choose another folder with -o.")
+    return stacks
+
+
+def with_stack(note: dict[str, Any], tell: Callable[[str], None]) -> dict[str, Any]:
+    """Return a note, which has `stacks_in`, with this machine's versions and device last.
+
+    Tells the user if other versions or another device trained the run last: its bytes may then differ.
+    """
+    before, now = note[MADE_BY], versions() | learned_with() | {"device": device()}
     if before and before[-1] != now:
         others = ", ".join(f"{name} {value}" for name, value in before[-1].items() if now.get(name) != value)
         if others:  # else an earlier version of this program noted fewer

@@ -88,10 +88,11 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
         fresh = programs.begin(table, params)
         table, params = jax.device_put((table, params), fresh.updates.sharding)  # once, not in every update
         learner = jax.tree.map(lambda x, like: jax.device_put(x, like.sharding), continued(out, fresh), fresh)
-        steps = int(learner.updates) * config.ppo.steps_per_update
-        if int(learner.updates) > config.ppo.updates:
+        updates = int(learner.updates)
+        steps, trains = updates * config.ppo.steps_per_update, updates < config.ppo.updates
+        if updates > config.ppo.updates:
             raise UserError(f"{out} has {steps:,} env steps of training already: set a larger ppo.env_steps.")
-        with recorded(out, note, COURSE, config.log, steps, policy_of, tell, require_ours) as run:
+        with recorded(out, note, COURSE, config.log, steps, policy_of, tell, require_ours, trains) as run:
             learner = update_until_done(programs, learner, table, params, recipe, config.interval, run, console)
             run.save(learner)
     tell_done(out, recipe.network.only_size(source.levels.size), tell)

@@ -16,6 +16,7 @@ import levelproof
 from levelproof.experts.networks.saved import WEIGHTS
 from levelproof.levelgen.level import size_of
 from levelproof.pipeline.errors import Failure, UserError
+from levelproof.pipeline.learn import run as writer
 from levelproof.pipeline.learn.clone import COURSE
 from levelproof.pipeline.learn.folder import (
     CHECKPOINT,
@@ -26,6 +27,7 @@ from levelproof.pipeline.learn.folder import (
     note_in,
     require_same_run,
     shown,
+    stacks_in,
     tell_done,
     with_stack,
     write_note,
@@ -81,7 +83,7 @@ def test_a_file_gets_kept_lines_and_one_every_half_minute(monkeypatch: pytest.Mo
 
 
 def test_run_that_saved_nothing_gives_way_to_other_settings(tmp_path: Path) -> None:
-    write_note(tmp_path, with_stack(tmp_path, {"settings": {"seed": 0}}, print))
+    write_note(tmp_path, {"settings": {"seed": 0}, MADE_BY: []})
     require_same_run(tmp_path, {"settings": {"seed": 1}})
     (tmp_path / CHECKPOINT).touch()
     with pytest.raises(UserError, match="seed was 0, now 1"):
@@ -133,13 +135,14 @@ def test_metrics_drop_a_half_written_line_and_later_ones(tmp_path: Path) -> None
 def test_run_that_another_stack_began_continues_and_says_so(tmp_path: Path) -> None:
     told = list[str]()
     (tmp_path / CHECKPOINT).touch()
-    write_note(tmp_path, here := with_stack(tmp_path, {"settings": {"seed": 0}}, told.append))
-    assert with_stack(tmp_path, {"settings": {"seed": 0}}, told.append) == here
+    here = with_stack({"settings": {"seed": 0}, MADE_BY: []}, told.append)
+    assert with_stack(here, told.append) == here
     assert not told
     (stack,) = here[MADE_BY]
-    write_note(tmp_path, {"settings": {"seed": 0}, MADE_BY: [stack | {"jax": "0.9"}]})
+    write_note(tmp_path, other := {"settings": {"seed": 0}, MADE_BY: [stack | {"jax": "0.9"}]})
     require_same_run(tmp_path, {"settings": {"seed": 0}})
-    assert with_stack(tmp_path, {"settings": {"seed": 0}}, told.append)[MADE_BY] == [stack | {"jax": "0.9"}, stack]
+    assert stacks_in(tmp_path) == other[MADE_BY]
+    assert with_stack(other, told.append)[MADE_BY] == [*other[MADE_BY], stack]
     assert told == [
         "This run was last trained with jax 0.9, so its policy may differ from that of an uninterrupted run."
     ]
@@ -154,4 +157,21 @@ def test_run_that_another_stack_began_continues_and_says_so(tmp_path: Path) -> N
     for damage in ("jax", ["jax"], {"jax": "0.9"}):
         write_note(tmp_path, {"seed": 0, MADE_BY: damage})
         with pytest.raises(Failure, match=r"run\.json is damaged \(made_by\)"):
-            with_stack(tmp_path, {"seed": 0}, told.append)
+            stacks_in(tmp_path)
+
+
+@pytest.mark.parametrize("trains", [False, True])
+def test_a_stack_is_noted_once_it_has_trained(trains: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    noted, told, before = list[Any](), list[str](), [{"jax": "0.9"}]
+    monkeypatch.setattr(writer, "keep_run", lambda out, policy, state: noted.append(policy))
+    (tmp_path / CHECKPOINT).touch()
+    write_note(tmp_path, {"seed": 0, MADE_BY: before})
+    policy_of: Any = lambda note, state: note[MADE_BY]
+    log = "none" if trains else "a logger"
+    with writer.recorded(tmp_path, {"seed": 0}, COURSE, log, 0, policy_of, told.append, list, trains) as run:
+        assert stacks_in(tmp_path) == before
+        if trains:
+            run.keep(None, {COURSE.step: 1, "bc/loss": 0.5}, "bc/loss", "train.learning_rate")
+        run.save(None)
+    assert noted[-1] == stacks_in(tmp_path)
+    assert [len(told), len(noted[-1])] == ([1, 2] if trains else [0, 1])
