@@ -283,8 +283,10 @@ def _loss(
 
 def _kl_weight(config: PPOConfig, update: Array) -> Float[Array, ""]:
     """Return the weight of the divergence from the start, at an update."""
+    if not config.kl_updates:
+        return jnp.zeros(())
     since = jnp.maximum(update - config.critic_updates, 0)
-    return config.kl_weight * jnp.maximum(1 - since / max(config.kl_updates, 1), 0.0)
+    return config.kl_weight * jnp.maximum(1 - since / config.kl_updates, 0.0)
 
 
 def _key(recipe: TrainingRecipe, purpose: int, update: Array) -> Key[Array, ""]:
