@@ -15,7 +15,7 @@ from levelproof.levelgen.task.observe.kinds import observe as observe_lanes
 from levelproof.physics.types import State
 from levelproof.pipeline.errors import UserError
 
-MIN_ROWS = 1024  # observed at once: fewer are padded, so that few programs serve all counts
+MIN_ROWS = 1024  # observed at once: fewer are padded
 COMPILING = Lock()  # or threads that need the same new program would each compile it
 T = TypeVar("T")
 
@@ -31,16 +31,16 @@ def parse_observation(name: str | None) -> ObservationType | None:
 
 def observe(kind: ObservationType, level: Level, states: State) -> Any:
     """Observe levels [batch, ...] in states [batch, time, ...]; return numpy arrays [batch, time, ...]."""
+    count = len(level.role)
     with COMPILING:
-        shown = _observe(kind, level, states)
-    return jax.device_get(shown)
+        shown = _observe(kind, *_padded((level, states), _power_of_two(count)))
+    return jax.tree.map(lambda x: x[:count], jax.device_get(shown))
 
 
 def observe_rows(kind: ObservationType, level: Level, row_level: Int[np.ndarray, " row"], states: State) -> Any:
     """Observe states [row, ...], each in its level of several [level, ...]; return numpy arrays [row, ...]."""
     count = len(row_level)
-    padded = max(MIN_ROWS, 1 << (count - 1).bit_length())
-    row_level, states = jax.tree.map(lambda x: np.resize(x, (padded, *x.shape[1:])), (row_level, states))
+    row_level, states = _padded((row_level, states), max(MIN_ROWS, _power_of_two(count)))
     with COMPILING:
         made = _observe_rows(kind, level, row_level, states)
     constant, changing = jax.device_get(made)
@@ -60,6 +60,16 @@ def _observe_rows(kind: ObservationType, level: Level, row_level: Any, states: S
     level, states = _lanes_last((level, states))
     changing = changing_features(kind, jax.tree.map(lambda x: x[..., row_level], level), states)
     return constant_features(kind, level).T, jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), changing)
+
+
+def _power_of_two(count: int) -> int:
+    """Return the least power of two that is not less than `count`, so that few programs serve all counts."""
+    return 1 << (count - 1).bit_length()
+
+
+def _padded(tree: T, count: int) -> T:
+    """Repeat the rows of arrays until there are `count`."""
+    return jax.tree.map(lambda x: x if len(x) == count else np.resize(x, (count, *x.shape[1:])), tree)
 
 
 def _lanes_last(tree: T) -> T:

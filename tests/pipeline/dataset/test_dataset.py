@@ -14,6 +14,7 @@ import levelproof
 from levelproof.levelgen.task.actions import action_mask
 from levelproof.levelgen.task.environment import make
 from levelproof.levelgen.task.observe.kinds import ObservationType
+from levelproof.pipeline.dataset import observations
 from levelproof.pipeline.dataset.batch import timed_out
 from levelproof.pipeline.dataset.dataset import Dataset, open
 from levelproof.pipeline.errors import Failure, UserError
@@ -90,6 +91,13 @@ def test_read_cuts_windows_from_trajectories(data: Dataset) -> None:
     assert_same(late.state.position[0, :56], whole.state.position[0, 200:])
     assert late.mask.sum() == 56
     assert_same(data.read(3, first=200, fields=["record/state"], observation=None).fields, late.fields)
+
+
+def test_batches_of_similar_sizes_share_a_program_of_observations(data: Dataset) -> None:
+    four = data.read([0, 1, 2, 3], length=3).observation
+    programs = observations._observe._cache_size()
+    np.testing.assert_array_equal(data.read([0, 1, 2], length=3).observation, four[:3])
+    assert observations._observe._cache_size() == programs
 
 
 def test_getitem_observation_equals_the_environments(data: Dataset) -> None:
