@@ -36,7 +36,9 @@ def plot(split: Path, query: RowQuery, out: Path) -> None:
     manifest = require_manifest(split, ["label", *NUMBERS, *columns_in(query.where)])
     table = select(manifest.table, query.where)
     numbers = [name for name in NUMBERS if not (name == "env_steps" and manifest.repeats)]  # seeds leave costs behind
-    values = {name.replace("_", " "): table[name].drop_null().to_numpy() for name in numbers}
+    trained = table.filter(pa.array(labelled(table, TRAINED)))  # other levels have success rates without an expert
+    rows = lambda name: trained if name == "success_rate" else table
+    values = {name.replace("_", " "): rows(name)[name].drop_null().to_numpy() for name in numbers}
     values = {name: column[~np.isnan(column)] for name, column in values.items()}
     values = {name: column for name, column in values.items() if len(column)}
     drawn = {label: _curves(split, table, label) for label in sorted(TRAINED)}

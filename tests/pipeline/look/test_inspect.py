@@ -191,6 +191,8 @@ def test_plot_draws_histograms_and_curves(
             assert picture.width > 1000
     plot(SAMPLE, RowQuery(where="level_id < 20"), tmp_path / name)
     assert "env steps" not in capsys.readouterr().out, "seeds leave costs behind"
+    plot(SAMPLE, RowQuery(where="label = 'trivial'"), tmp_path / name)
+    assert "success rate" not in capsys.readouterr().out, "these levels have no expert"
     with pytest.raises(UserError, match=r"must end in \.svg or \.png"):
         plot(split, RowQuery(), tmp_path / "split.pdf")
     with pytest.raises(UserError, match="nothing to draw"):
