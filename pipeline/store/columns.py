@@ -119,7 +119,7 @@ DESCRIBED = (
     ManifestColumn(
         "portability",
         pa.float32(),
-        "Witness replays from starts differing by rounding that reach the goal",
+        "Witness replays from starts differing by rounding that reach the goal; no column counts their env steps",
         "share",
         f"{NO_WITNESS}, an imported one, or `expert.replays=0`",
     ),
