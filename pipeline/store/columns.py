@@ -90,14 +90,15 @@ DESCRIBED = (
         "success_rate",
         pa.float32(),
         "First episodes of the expert with sampled actions that reach the goal, in attempts after its training that do "
-        "not affect the label",
+        "not affect the label; trivial levels have 1, unsolvable ones 0, without an expert",
         "share",
         NO_ATTEMPTS,
     ),
     ManifestColumn(
         "most_probable_succeeds",
         pa.bool_(),
-        "In the last evaluation, all finished episodes with the most probable actions reach the goal",
+        "In the last evaluation, all finished episodes with the most probable actions reach the goal; trivial levels "
+        "have true, unsolvable ones false, without an expert",
     ),
     ManifestColumn(
         "sticky_success_rate",
