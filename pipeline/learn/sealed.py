@@ -41,7 +41,7 @@ def known_sealed(size: str) -> KnownSealed | None:
 
 @cache
 def sealed_hashes() -> frozenset[str]:
-    """Return the content hashes of all sealed levels, which identify copies from files or imports despite other ids."""
+    """Return the content hashes of all sealed levels, which identify bit-equal copies whatever their ids."""
     digests = np.load(Path(__file__).with_name(HASHES))
     return frozenset(f"c{VERSION}:{bytes(digest).hex()}" for digest in digests)
 
