@@ -120,9 +120,11 @@ class Sealer:
         if self._running and not self._running[1].done():
             return
         self._account()
+        if self._broken:
+            return
         end = None if first is None else fragment_path(self._split, unit_name(first, first))
         group = store.due((piece for piece in self._pieces.values() if end is None or piece.path < end), store.ROWS)
-        if group and not self._broken:
+        if group:
             self._running = group, self._thread.submit(self._seal, group)
 
     def finish(self) -> None:

@@ -72,13 +72,18 @@ def test_sealer_waits_for_running_units_but_not_for_failed_ones(split: Path, mak
     assert read_manifest(split).level_ids.tolist() == [0, 1, 2, 3, 4, 5]
 
 
-def test_sealer_reports_an_error_once_and_never_ends_the_job(split: Path, make: Make) -> None:
+def test_sealer_reports_an_error_once_and_never_ends_the_job(
+    split: Path, make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     messages: list[str] = []
     shard = next((split / "shards").iterdir())
     (shard / "act/c/0/0/0").write_bytes(b"x")
     with sealing(split, read_manifest(split, []).fragments, messages.append) as sealer:
         for i in range(2, len(UNITS)):
             make(sealer, UNITS[i], UNITS[i + 1 :])
+        sealer.finish()
+        monkeypatch.delattr(store, "due")  # nothing more is planned
+        sealer.advance(None)
     (sentence,) = messages
     assert sentence.startswith(f"Not sealed (The shard {shard} is missing or damaged")
     assert sentence.endswith(f"run `levelproof seal {split}` when this job has ended.")
