@@ -88,8 +88,7 @@ def prepare_jax(
     os.environ.update(dict.fromkeys(XLA_THREADS, str(threads)))
     os.environ.update(dict.fromkeys(NUMPY_THREADS, "1"))
     if core is not None and sys.platform == "linux":  # other systems have no affinity
-        for thread in os.listdir("/proc/self/task"):  # all threads of this process; later ones inherit the affinity
-            os.sched_setaffinity(int(thread), {core})
+        _pin(core)
     import jax  # reads the environment above
 
     programs = own_folder(cache_folder() / "jax", "delete it")
@@ -103,6 +102,13 @@ def prepare_jax(
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     share_compiling()
+
+
+def _pin(core: int) -> None:
+    """Pin all threads of this process to a core; later threads inherit the affinity."""
+    for thread in os.listdir("/proc/self/task"):
+        with suppress(ProcessLookupError):  # the thread has ended
+            os.sched_setaffinity(int(thread), {core})
 
 
 def spare_imports() -> None:

@@ -69,6 +69,21 @@ def test_xla_computes_on_one_thread(tmp_path: Path) -> None:
     assert int(python(COUNT, tmp_path)) <= 1
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no affinity")
+def test_pin_skips_threads_that_have_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    pinned: list[int] = []
+
+    def pin(thread: int, cores: set[int]) -> None:
+        if thread == 1:
+            raise ProcessLookupError
+        pinned.append(thread)
+
+    monkeypatch.setattr(os, "listdir", lambda _: ["1", "2"])
+    monkeypatch.setattr(os, "sched_setaffinity", pin)
+    runtime._pin(0)
+    assert pinned == [2]
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux" or len(own_cores()) < 2, reason="reads /proc; needs a second core")
 def test_own_core_pins_no_worker_if_cores_are_left_over(tmp_path: Path) -> None:
