@@ -118,7 +118,7 @@ def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board
             crew.start_workers()
             crew.order()
             settle(crew.wait())
-            board.refresh()
+            board.refresh(working=bool(scheduler.workers))
             if stop.asked.is_set():
                 board.say(STOPPING)
                 settle(crew.leave(stop.grace))
@@ -317,11 +317,11 @@ class Crew:
         self._handles = usable
 
     def _notice_silence(self, working: bool) -> None:
-        """Tell the user once if no worker starts for PATIENCE seconds."""
+        """Tell the user once if no worker has run for PATIENCE seconds."""
         if working:
             self._notice_at = time.monotonic() + PATIENCE
         elif time.monotonic() > self._notice_at:
-            self._board.say("No worker has started yet: `ray status` shows which resources are free.")
+            self._board.say("No worker is running: `ray status` shows which resources are free.")
             self._notice_at = float("inf")
 
 

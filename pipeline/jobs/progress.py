@@ -78,7 +78,7 @@ class Tally:
             tail = "done" if self.done == self.levels else "writing"
         elif left is None:
             of_them = f", {compiled} of {programs} programs" if compiled < programs else ""
-            tail = f"{pace} · {'...' if rate else f'compiling{of_them}'}"
+            tail = f"{pace} · {'...' if self.steps else f'compiling{of_them}'}"
         else:
             tail = f"{pace} · about {duration(left)} left"
         return f"{self.decided:,}/{self.levels:,} levels · {self.solved_so_far:,} solved · {tail}"
@@ -108,16 +108,20 @@ class Board:
     def shown(self) -> AbstractContextManager[object]:
         return self._bar if self._console.is_interactive else nullcontext()
 
-    def refresh(self, every: float = LINE_EVERY) -> None:
-        """Update the bar, or print a line unless one was printed in the last `every` seconds."""
+    def refresh(self, every: float = LINE_EVERY, working: bool = True) -> None:
+        """Update the bar, or print a line unless one was printed in the last `every` seconds.
+
+        If no worker is `working`, there is no pace, whatever it was before.
+        """
         steps, levels = self._pace.tasks
         if self.tally.steps != steps.completed and self._pace.get_time() - self._paced_at >= PACE_EVERY:
             self._paced_at = self._pace.get_time()
             self._pace.update(self._steps, completed=self.tally.steps)
             self._pace.update(self._levels, completed=self.tally.share * self.tally.levels)
+        rate, left = (steps.speed or 0.0, levels.time_remaining) if working else (0.0, None)
         for watcher in self.watchers:
-            watcher(steps.speed or 0.0, levels.time_remaining)
-        text, now = self.tally.text(steps.speed or 0.0, levels.time_remaining), time.monotonic()
+            watcher(rate, left)
+        text, now = self.tally.text(rate, left), time.monotonic()
         if self._console.is_interactive:
             self._bar.update(self._task, completed=self.tally.share, description=text)
         elif now - self._line_at >= every:

@@ -91,6 +91,20 @@ def test_board_keeps_its_pace_during_a_pause() -> None:
     assert "100 env steps/s · about 62 s left" in text.getvalue().splitlines()[-1]
 
 
+def test_board_has_no_pace_without_workers() -> None:
+    now, time = tally(), [0.0]
+    board, text = board_at(now, time)
+    seen: list[tuple[float, float | None]] = []
+    board.watchers.append(lambda rate, left: seen.append((rate, left)))
+    for steps in (100, 200):
+        time[0] += 1.0
+        now.running[UNIT] = (steps, steps / 100, 0)
+        board.refresh(0.0)
+    board.refresh(0.0, working=False)
+    assert seen[1:] == [(100.0, 62.0), (0.0, None)]
+    assert text.getvalue().endswith("· 0 env steps/s · ...\n")
+
+
 def test_board_takes_no_pace_from_two_moments() -> None:
     now, time = tally(), [0.0]
     board, text = board_at(now, time)
