@@ -72,6 +72,14 @@ def stand_ins(tmp_path: Path) -> dict[str, str]:
     return os.environ | slurm | array | {"PATH": f"{tmp_path}:{os.environ['PATH']}", "PAUSE": "0"}
 
 
+def test_kubernetes_example_counts_quarantined_units_as_done(tmp_path: Path, stand_ins: dict[str, str]) -> None:
+    command = yaml.safe_load((FOLDER / "kubernetes.yaml").read_text())["spec"]["entrypoint"]
+    for code, is_done in (0, True), (3, True), (1, False):
+        (tmp_path / "codes").write_text(f"{code}\n")
+        done = subprocess.run(["sh", "-c", command], cwd=tmp_path, env=stand_ins, timeout=patience(60))
+        assert (done.returncode == 0) == is_done
+
+
 def log(folder: Path) -> list[str]:
     return (folder / "log").read_text().splitlines()
 
