@@ -14,6 +14,7 @@
 set -u
 sizes=(s m l)
 size=${sizes[$SLURM_ARRAY_TASK_ID]}
+export LEVELPROOF_CACHE_DIR=${TMPDIR:-/tmp}/levelproof-$UID # on the machine's own disk: homes may be shared
 
 levelproof generate size="$size" levels=100k budget=256k checkpoint=10min out=data &
 job=$!

@@ -10,6 +10,7 @@
 #SBATCH --requeue
 #SBATCH --open-mode=append
 set -u
+export LEVELPROOF_CACHE_DIR=${TMPDIR:-/tmp}/levelproof-$UID # on the machine's own disk: homes may be shared
 mapfile -t hosts < <(scontrol show hostnames "$SLURM_JOB_NODELIST")
 head=${hosts[0]}
 export RAY_ADDRESS=$head:6379 OMP_NUM_THREADS=1
