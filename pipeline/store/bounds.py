@@ -128,14 +128,16 @@ class Bounded:
         stored_as: Mapping[str, str],
         level_ids: np.ndarray | None = None,
         compact: bool = False,
+        at: np.ndarray | None = None,
     ) -> pa.Table:
-        """Read columns, of all rows or, with `level_ids`, at least of the rows of these levels.
+        """Read columns, of all rows or, with `level_ids` or `at`, at least of the rows of these levels or positions.
 
         Args:
             names: columns to read.
             stored_as: names in the file of all columns that it must have.
             level_ids: levels whose row groups to read.
             compact: return repetitive columns as dictionaries.
+            at: positions whose row groups to read, if they are known.
 
         Raises:
             One of DAMAGE: the file is damaged, or would take too much memory.
@@ -145,9 +147,10 @@ class Bounded:
             raise ValueError(f"its columns are not those of a {self._kind.name}")
         groups = range(len(self._groups))
         if level_ids is not None and groups[1:]:
-            matches = np.isin(self._read(known, groups, ["level_id"]).column(0).to_numpy(), level_ids)
+            at = np.flatnonzero(np.isin(self._read(known, groups, ["level_id"]).column(0).to_numpy(), level_ids))
+        if at is not None:
             ends = np.cumsum([group.rows for group in self._groups])
-            groups = np.unique(np.searchsorted(ends, np.flatnonzero(matches), "right")).tolist()
+            groups = np.unique(np.searchsorted(ends, at, "right")).tolist()
         table = self._read(known, groups, [stored_as[name] for name in names])
         wanted = _schema_of(self._kind, names, compact)
         stored = {name: table.column(stored_as[name]) for name in names}

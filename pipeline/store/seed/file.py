@@ -5,6 +5,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -94,10 +95,33 @@ def read_seed(
         UserError: it is not a seed file.
         Failure: it is missing, damaged, or has another version.
     """
+    at = None if level_ids is None else find_levels(path, level_ids)[1]
     with _opened(path) as (about, file, stored_as):
-        table = file.read(list(dict.fromkeys(["level_id", *names])), stored_as, level_ids, compact)
+        table = file.read(list(dict.fromkeys(["level_id", *names])), stored_as, compact=compact, at=at)
         _check(table)
         return about, table
+
+
+def find_levels(path: Path, level_ids: np.ndarray) -> tuple[SeedFile, np.ndarray]:
+    """Return what a seed file says of itself, and the positions of its rows of these levels (ascending).
+
+    A process reads a local file for this once, because it may ask for a few levels at a time. Raises as `read_seed`.
+    """
+    state = written(path)
+    about, ids = _read_ids(path) if state is None else _known_ids(path, state)
+    possible = level_ids[(level_ids >= 0) & (level_ids <= MAX_LEVEL_ID)].astype(ids.dtype)  # else `ids` are converted
+    first, end = np.searchsorted(ids, possible), np.searchsorted(ids, possible, "right")
+    return about, first[first < end]
+
+
+def _read_ids(path: Path) -> tuple[SeedFile, np.ndarray]:
+    about, table = read_seed(path, [])
+    return about, table.column("level_id").to_numpy()
+
+
+@cache
+def _known_ids(path: Path, _: tuple[int, ...]) -> tuple[SeedFile, np.ndarray]:
+    return _read_ids(path)
 
 
 @contextmanager

@@ -23,7 +23,7 @@ from levelproof.pipeline.store.fragment import Fragment
 from levelproof.pipeline.store.progress_bar import shown_blocks
 from levelproof.pipeline.store.remote import absolute, as_typed, forget
 from levelproof.pipeline.store.seed.columns import KEPT
-from levelproof.pipeline.store.seed.file import SeedFile, damaged_seed, read_seed, seed_files
+from levelproof.pipeline.store.seed.file import SeedFile, damaged_seed, find_levels, read_seed, seed_files
 from levelproof.pipeline.store.seed.source import LevelSource
 
 IDENTITIES = ("content_hash", "signature")
@@ -54,10 +54,7 @@ def seed_parts(
     for path in seed_files(source):
         forget(path)  # a remote one may have been replaced since it was last opened
         wanted = [name for column in names for name in MADE_FROM.get(column, ())]
-        about, rows = read_seed(path, wanted, level_ids, compact=True)
-        rows = rows.append_column("row", pa.array(_positions(path, rows, about), pa.int32()))
-        if level_ids is not None:
-            rows = rows.filter(np.isin(rows.column("level_id").to_numpy(), level_ids))
+        about, rows = _rows(path, wanted, level_ids)
         identities = _identities(about, rows) if {*IDENTITIES} & {*names} and rows.num_rows else {}
         try:
             table = manifest_rows(about, rows, identities, names, compact)
@@ -67,12 +64,18 @@ def seed_parts(
     return parts
 
 
-def _positions(path: Path, rows: pa.Table, about: SeedFile) -> np.ndarray:
-    """Return the positions of rows in their file, of which some row groups may not have been read."""
-    if rows.num_rows == about.fragment.rows:
-        return np.arange(rows.num_rows)
-    all_ids = read_seed(path, [])[1].column("level_id").to_numpy()
-    return np.searchsorted(all_ids, rows.column("level_id").to_numpy())
+def _rows(path: Path, names: Sequence[str], level_ids: np.ndarray | None) -> tuple[SeedFile, pa.Table]:
+    """Read rows with `row`, their positions in the file; it is not opened if it is known to have none of the levels."""
+    if level_ids is None:
+        about, rows = read_seed(path, names, compact=True)
+        at = np.arange(rows.num_rows)
+    else:
+        about, at = find_levels(path, level_ids)
+        if not len(at):
+            return about, pa.table({})
+        rows = read_seed(path, names, level_ids, compact=True)[1]
+        rows = rows.filter(np.isin(rows.column("level_id").to_numpy(), level_ids))
+    return about, rows.append_column("row", pa.array(at, pa.int32()))
 
 
 def manifest_rows(

@@ -31,6 +31,7 @@ from levelproof.pipeline.jobs.schedule import Order, WorkUnit
 from levelproof.pipeline.store.contents import table_for
 from levelproof.pipeline.store.fields import arrays_of
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
+from levelproof.pipeline.store.seed import file
 from levelproof.pipeline.store.seed.columns import SCHEMA, WRITTEN
 from levelproof.pipeline.store.seed.packed import MAX_RUN, pack_witness, unpack_witnesses
 from levelproof.pipeline.store.seed.shard import SeedShard, play_seeds
@@ -255,6 +256,23 @@ def test_grow_continues_and_takes_a_folder_of_parts(seed: Path, split: Path, gro
     before = [path.stat().st_mtime_ns for path in fragment_paths(out)]
     assert grow(parts, out, [*INLINE, "density=witness"], QUIET) == Exit.DONE
     assert [path.stat().st_mtime_ns for path in fragment_paths(out)] == before
+
+
+def test_levels_are_read_from_their_file_alone(
+    seed: Path, split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once the ids of a folder's files are known; workers ask for a unit's levels at a time."""
+    export_seed(split, "level_id < 20", tmp_path / "part-000.parquet")
+    export_seed(split, "level_id >= 20", tmp_path / "part-001.parquet")
+    ids, opened = read_manifest(seed, []).level_ids, list[str]()
+    read_manifest(tmp_path, ["row"], ids)
+    bounded = file.bounded
+    monkeypatch.setattr(file, "bounded", lambda path, kind: opened.append(path.name) or bounded(path, kind))
+    late = ids[ids >= 20][1:2]
+    assert read_manifest(tmp_path, ["row"], [-1, *late, 2**40]).level_ids.tolist() == late.tolist()
+    assert opened == ["part-001.parquet"]
+    shutil.copy(tmp_path / "part-000.parquet", tmp_path / "part-001.parquet")
+    assert not len(read_manifest(tmp_path, ["row"], late).level_ids), "the file was rewritten"
 
 
 def rewritten(seed: Path, path: Path, **columns: Any) -> Path:
