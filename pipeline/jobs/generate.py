@@ -13,7 +13,7 @@ from rich.console import Console
 from levelproof.configs.schema import GrowConfig, JobConfig
 from levelproof.experts.labels import Label
 from levelproof.experts.steps import EnvSteps
-from levelproof.pipeline.errors import Exit, Failure, UserError
+from levelproof.pipeline.errors import Exit, UserError
 from levelproof.pipeline.jobs.choice import runs_here
 from levelproof.pipeline.jobs.events import Events, recording
 from levelproof.pipeline.jobs.log import logged, require_library
@@ -181,7 +181,7 @@ def _work(
             board.ended(unit, outcome.summary)
             if outcome.fatal:
                 events.ended(outcome)
-                raise Failure(outcome.fatal)
+                raise outcome.kind(outcome.fatal)
             if outcome.summary:
                 events.ended(outcome)
                 sealer.committed(outcome.summary.fragment or unit.name, outcome.summary.levels)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from levelproof.experts.steps import NO_SECONDS, EnvSteps, Seconds
+from levelproof.pipeline.errors import Failure, LevelproofError
 from levelproof.pipeline.jobs.sizing import UnitSize
 from levelproof.pipeline.store.layout import unit_name
 from levelproof.pipeline.store.origins import Origin
@@ -104,6 +105,7 @@ class UnitOutcome:
     summary: Summary | None = None  # None: it failed
     reason: str = ""  # traceback of the failure, for the quarantine file
     fatal: str = ""  # a sentence that stops the run, if no further attempt can succeed
+    kind: type[LevelproofError] = Failure  # of the error that stops the run
 
     @property
     def cause(self) -> str:

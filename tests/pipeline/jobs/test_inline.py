@@ -4,6 +4,7 @@ import io
 import re
 import time
 from collections.abc import Callable
+from pathlib import Path
 from threading import Barrier, Lock
 from typing import Any
 
@@ -11,12 +12,14 @@ import pytest
 from rich.console import Console
 
 from levelproof.experts.steps import EnvSteps
-from levelproof.pipeline.jobs import inline
+from levelproof.pipeline.errors import Exit, StoreFailure, UserError
+from levelproof.pipeline.jobs import inline, worker
 from levelproof.pipeline.jobs.inline import Handle, _compile_side_by_side, _work
 from levelproof.pipeline.jobs.progress import STOPPING, Board, Tally
 from levelproof.pipeline.jobs.schedule import Order, Round, Summary, UnitOutcome, WorkUnit, schedule
 from levelproof.pipeline.stopping import Stop
 from tests.pace import patience
+from tests.pipeline.command import TINY, here
 
 CORES, PROGRAMS = 2, 6
 
@@ -53,7 +56,7 @@ def compiled(ahead: Any, stop: Stop) -> tuple[float, str]:
     """Compile a job's programs; return the threads' seconds, and what the board shows."""
     text = io.StringIO()
     board = Board(Tally(64, 0, 0), Console(file=text))
-    board.refresh = lambda every=0.0: Board.refresh(board, 0.0)
+    board.refresh = lambda every=0.0, working=True: Board.refresh(board, 0.0, working)
     return _compile_side_by_side(ahead, CORES, board, stop), text.getvalue()
 
 
@@ -118,6 +121,18 @@ def test_workers_commit_what_they_can_before_a_stop() -> None:
     committed, text = made(stop.asked.set, stop)
     assert committed == [0, 1, 2, 3, 4, 5], "a unit each, and half of what is left"
     assert STOPPING in text
+
+
+@pytest.mark.parametrize(("error", "code"), [(UserError("Why."), Exit.INPUT), (StoreFailure("Why."), Exit.FAILED)])
+def test_fatal_error_of_a_worker_decides_the_exit_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, code: Exit
+) -> None:
+    def fail(*_: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(worker, "begin_unit", fail)
+    done = here(["generate", *TINY, "executor=inline"], tmp_path)
+    assert (done.returncode, done.stderr.splitlines()[-1]) == (code, "Error: Why.")
 
 
 def test_failure_in_a_worker_ends_the_job() -> None:

@@ -159,7 +159,7 @@ def test_workers_without_locks_stop_the_run(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr("levelproof.pipeline.jobs.worker.begin_unit", refuse)
     unit = WorkUnit((0,))
     (ended,) = Worker(made_job(), tmp_path).work(Order([unit]), 1.0).outcomes
-    assert ended == UnitOutcome(unit, reason=ended.reason, fatal="no locks here")
+    assert ended == UnitOutcome(unit, reason=ended.reason, fatal="no locks here", kind=UserError)
 
 
 def test_without_commits_reports_its_wait_and_can_be_stopped(tmp_path: Path) -> None:
