@@ -9,7 +9,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ from levelproof.pipeline.jobs.places import bytes_of_worker, memory_to_reserve, 
 from levelproof.pipeline.jobs.progress import STOPPING, Board, Meters
 from levelproof.pipeline.jobs.schedule import Round, Scheduler, Settle, UnitOutcome, levels_text, until_report
 from levelproof.pipeline.runtime import NO_GPU, jax_sees_a_gpu, own_cores
-from levelproof.pipeline.stopping import Stop
+from levelproof.pipeline.stopping import GRACE, Stop
 from levelproof.pipeline.store.leases import require_served, served
 from levelproof.pipeline.store.remote import absolute
 from levelproof.pipeline.words import duration
@@ -117,7 +117,14 @@ def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board
             crew.follow_cluster()
             crew.start_workers()
             crew.order()
-            settle(crew.wait())
+            outcomes = crew.wait()
+            try:
+                settle(outcomes)
+            except Exception:
+                board.say("This job fails, once decided levels are committed.")
+                with suppress(Exception):  # the first failure counts
+                    settle(crew.leave(GRACE))
+                raise
             board.refresh(working=bool(scheduler.workers))
             if stop.asked.is_set():
                 board.say(STOPPING)
@@ -261,7 +268,7 @@ class Crew:
         if round.leaves:
             self._scheduler.leave(handle)
             handle.end()
-        return round.outcomes
+        return [each.on(handle.host) for each in round.outcomes] if ray_address() else round.outcomes
 
     def _lose(self, handle: WorkerHandle, reason: str, sentence: str = "") -> Sequence[UnitOutcome]:
         """Account for a worker's death; its units failed, unless its machine is lost as well."""

@@ -5,7 +5,7 @@ Knows nothing of files, Ray, or the time.
 
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from heapq import nlargest
 from itertools import chain, groupby
 from typing import Any, NamedTuple
@@ -112,6 +112,10 @@ class UnitOutcome:
         """The last line of the reason, without the note that JAX adds."""
         lines = self.reason.split(JAX_NOTE)[0].strip().splitlines()
         return lines[-1] if lines else self.fatal
+
+    def on(self, host: str) -> "UnitOutcome":
+        """Name the worker's machine in the sentence that stops the run, unless it does."""
+        return self if not self.fatal or f"on {host}" in self.fatal else replace(self, fatal=f"On {host}: {self.fatal}")
 
 
 Settle = Callable[[Sequence[UnitOutcome]], None]  # accounts for attempts that ended together

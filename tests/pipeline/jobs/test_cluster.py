@@ -10,7 +10,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import nullcontext, suppress
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,7 +27,8 @@ from levelproof.pipeline.jobs import cluster, likeness
 from levelproof.pipeline.jobs.address import noticing_slow_starts, require_reachable
 from levelproof.pipeline.jobs.likeness import mismatch, program_of, unseen, with_absolute_paths
 from levelproof.pipeline.jobs.progress import Board, Tally
-from levelproof.pipeline.jobs.schedule import MAX_UNITS, Scheduler, WorkUnit
+from levelproof.pipeline.jobs.schedule import MAX_UNITS, Round, Scheduler, UnitOutcome, WorkUnit
+from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store.layout import JOB
 from levelproof.pipeline.store.leases import served
 from levelproof.pipeline.store.locks import only_writer
@@ -381,6 +383,37 @@ def test_crew_hands_on_the_units_of_a_lost_machine(monkeypatch: pytest.MonkeyPat
     assert crew._scheduler.waiting == 2
     crew._scheduler.join(other, 0.0)
     assert crew._scheduler.order(other, 0.0).units == [WorkUnit((0,))]
+
+
+def test_crew_names_the_machine_of_a_fatal_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    handle = cluster.WorkerHandle("a", "a", up=True)
+    crew, _ = crew_of(monkeypatch, [handle])
+    full = UnitOutcome(WorkUnit((0,)), fatal="Cannot write to /tmp, because the disk is full.")
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:9")
+    (outcome,) = crew._report(handle, Round([full], {}, 0))
+    assert outcome.fatal == "On a: Cannot write to /tmp, because the disk is full."
+    named = replace(full, fatal="The worker on a does not find level 0.")
+    assert named.on("a") == named
+
+
+def test_fatal_failure_lets_other_workers_commit(monkeypatch: pytest.MonkeyPatch) -> None:
+    answers = {"wait": ["full disk"], "leave": ["committed", "full disk"]}
+    calls = {name: lambda *_, found=found: found for name, found in answers.items()}
+    calls |= dict.fromkeys(("follow_cluster", "start_workers", "order"), lambda: None)
+    monkeypatch.setattr(cluster, "connected", nullcontext)
+    monkeypatch.setattr(cluster, "Crew", lambda *_: SimpleNamespace(**calls))
+    settled: list[Any] = []
+
+    def settle(outcomes: Any) -> None:
+        for outcome in outcomes:
+            settled.append(outcome)
+            if outcome == "full disk":
+                raise Failure(f"{outcome} {len(settled)}")
+
+    board = Board(Tally(1, 0, 0), Console(quiet=True))
+    with pytest.raises(Failure, match="full disk 1"), stoppable() as stop:
+        cluster.run(made_job("data"), SPLIT, Scheduler([WorkUnit((0,))], 1), settle, board, stop)
+    assert settled == ["full disk", "committed", "full disk"]
 
 
 def test_crew_starts_thousands_of_workers_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
