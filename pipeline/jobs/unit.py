@@ -80,7 +80,7 @@ def finish_unit(job: JobConfig, split: Path, unit: WorkUnit, run: TrainingRun) -
         check_witnesses(result, job.task)
     commit(job, split, unit, result)
     if job.checkpoint:
-        drop_paused(split, unit.name, unit.level_ids)
+        drop_paused(split, unit.level_ids)
     labels = [verdict.label for verdict in result.verdicts]
     return Summary(len(labels), labels.count(Label.SOLVED), result.spent, result.ledger.total())
 

@@ -107,25 +107,24 @@ def load_paused(split: Path, level_ids: Collection[int], job: JobConfig) -> dict
         StoreFailure: the store does not answer.
     """
     wanted, experts = set(level_ids), dict[int, Paused]()
-    for path in _paths(split, CHECKPOINT):
-        first, last = ids_of(path)
-        if not any(first <= level_id <= last for level_id in wanted):
-            continue
+    for path in _paths_of(split, wanted):
         for level_id, expert in _load(path, wanted, job).items():
             if level_id not in experts or _updates(expert) > _updates(experts[level_id]):
                 experts[level_id] = expert
     return experts
 
 
-def drop_paused(split: Path, unit: str, level_ids: Collection[int]) -> None:
-    """Remove the checkpoint of a committed unit of these levels; leave one that cannot be read to `prune_paused`.
+def drop_paused(split: Path, level_ids: Collection[int]) -> None:
+    """Remove checkpoints of these levels, of a committed unit, under whatever unit's name they were saved.
 
-    A checkpoint with experts of other levels stays: a unit keeps its name when it returns levels in its middle.
+    A checkpoint with experts of other levels, too, or that cannot be read, is left to `prune_paused`.
     """
-    path = checkpoint_path(split, unit)
-    with suppress(OSError, LevelproofError, _DamagedError):
-        if set(level_ids).issuperset(_head(path).level_ids):
-            remove(path)
+    done = set(level_ids)
+    with suppress(OSError, LevelproofError):
+        for path in _paths_of(split, done):
+            with suppress(OSError, LevelproofError, _DamagedError):
+                if done.issuperset(_head(path).level_ids):
+                    remove(path)
 
 
 def prune_paused(split: Path, done: np.ndarray, say: Callable[[str], None]) -> None:
@@ -159,6 +158,12 @@ def _judged(path: Path, done: np.ndarray) -> tuple[str, bool]:
         return f"is damaged ({error}) and was removed: its experts train from the start", True
     except (OSError, LevelproofError) as error:
         return f"cannot be read ({_reason(error)}): it stays until its levels are done", False
+
+
+def _paths_of(split: Path, level_ids: set[int]) -> list[Path]:
+    """List the checkpoints whose names may include some of these levels."""
+    spans = [(path, *ids_of(path)) for path in _paths(split, CHECKPOINT)]
+    return [path for path, first, last in spans if any(first <= level_id <= last for level_id in level_ids)]
 
 
 def _paths(split: Path, pattern: re.Pattern[str]) -> list[Path]:

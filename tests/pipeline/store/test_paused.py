@@ -71,14 +71,21 @@ def test_load_paused_restores_every_bit(split: Path, kept: dict[int, Paused]) ->
     same(load_paused(split, range(8), JOB), kept)
     same(load_paused(split, [7, 9], JOB), {7: kept[7]})
     assert load_paused(split, [5, 8], JOB) == {}
-    drop_paused(split, UNIT, range(3, 8))
+    drop_paused(split, range(3, 8))
     assert load_paused(split, range(8), JOB) == {}
-    drop_paused(split, UNIT, range(3, 8))
+    drop_paused(split, range(3, 8))
 
 
 def test_drop_keeps_experts_of_levels_that_were_cut_from_the_unit(split: Path, kept: dict[int, Paused]) -> None:
-    drop_paused(split, UNIT, [3, 4, 5, 6])
+    drop_paused(split, [3, 4, 5, 6])
     same(load_paused(split, range(8), JOB), kept)
+
+
+def test_drop_removes_checkpoints_of_other_units_that_had_the_levels(split: Path, kept: dict[int, Paused]) -> None:
+    """Levels that a stopped worker returns become another unit."""
+    save_paused(split, unit_name(0, 9), {7: kept[7]}, JOB)
+    drop_paused(split, [2, 3, 7, 8])
+    assert load_paused(split, range(10), JOB) == {}
 
 
 def test_load_paused_prefers_the_later_checkpoint(split: Path, kept: dict[int, Paused]) -> None:
