@@ -11,7 +11,7 @@ from pathlib import Path
 
 from levelproof.configs.schema import JobConfig
 from levelproof.pipeline.store.leases import is_written_by
-from levelproof.pipeline.store.provenance import versions
+from levelproof.pipeline.store.provenance import learned_with, versions
 from levelproof.pipeline.store.remote import absolute, as_typed, is_remote
 
 Program = dict[str, str]  # versions by name
@@ -23,7 +23,7 @@ FOLDERS = ("physics", "levelgen", "experts", "configs", "pipeline")
 def program_of(job: JobConfig) -> Program:
     """Return the versions and hashes that must be equal in all processes that make a job's levels."""
     known = {name: str(versions()[name]) for name in COMPARED}
-    return known | {"source": _source(), "configuration": job.hash}
+    return known | learned_with() | {"source": _source(), "configuration": job.hash}
 
 
 def mismatch(program: Program, job: JobConfig) -> str:
@@ -33,7 +33,7 @@ def mismatch(program: Program, job: JobConfig) -> str:
         if here.get(name) != there:
             return (
                 f"The worker on {socket.gethostname()} has {name} {here.get(name, 'unknown')}, and this command {name} "
-                f"{there}: install the same levelproof there, start its Ray again, and run the same command."
+                f"{there}: install the same versions there, start its Ray again, and run the same command."
             )
     return ""
 

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import reduce
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -31,7 +30,7 @@ from levelproof.pipeline.store.files import write
 from levelproof.pipeline.store.locks import only_trainer
 from levelproof.pipeline.store.manifest import changes_text, differences
 from levelproof.pipeline.store.progress_bar import LINE_EVERY
-from levelproof.pipeline.store.provenance import device, versions
+from levelproof.pipeline.store.provenance import device, learned_with, versions
 from levelproof.pipeline.urls import quoted
 
 CHECKPOINT, RUN = "checkpoint.safetensors", "run.json"
@@ -110,11 +109,6 @@ def with_stack(note: dict[str, Any], tell: Callable[[str], None]) -> dict[str, A
             differs = "so its policy may differ from that of an uninterrupted run"
             tell(f"This run was last trained with {others}, {differs}.")
     return note | {MADE_BY: before if before[-1:] == [now] else [*before, now]}
-
-
-def learned_with() -> dict[str, str]:
-    """Return the versions of the libraries that decide a learner's bytes, besides those of every row."""
-    return {name: version(name) for name in ("numpy", "flax", "optax")}
 
 
 def _without(note: Any, path: Sequence[str]) -> Any:

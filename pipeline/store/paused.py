@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from zipfile import BadZipFile
 
+import jax
 import numpy as np
 
 from levelproof.configs.schema import JobConfig
@@ -42,7 +43,7 @@ from levelproof.pipeline.store.layout import (
     ids_of,
 )
 from levelproof.pipeline.store.leases import require_served
-from levelproof.pipeline.store.provenance import device, versions
+from levelproof.pipeline.store.provenance import device, learned_with, versions
 from levelproof.pipeline.store.remote import as_typed, at_once, is_remote
 
 MAGIC = b"levelproof checkpoint "  # start of a head
@@ -64,7 +65,7 @@ class _Head(NamedTuple):
     """The first line of a checkpoint."""
 
     level_ids: tuple[int, ...]
-    stamp: str  # configuration, versions and device; with others, results would differ
+    stamp: str  # configuration, versions, device, optimiser; with others, results would differ
     start: int  # of the archive, in bytes
     sha256: str  # of the archive
 
@@ -185,7 +186,8 @@ def _arrays(paused: Paused) -> Any:
 
 
 def _stamp(job: JobConfig) -> str:
-    return json.dumps([job.hash, versions(), device()], sort_keys=True)
+    unoptimised = jax.config.values["jax_disable_most_optimizations"]  # commands leave it to the user
+    return json.dumps([job.hash, versions() | learned_with(), device(), unoptimised], sort_keys=True)
 
 
 def _load(path: Path, wanted: set[int], job: JobConfig) -> dict[int, Paused]:

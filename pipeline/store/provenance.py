@@ -25,6 +25,12 @@ def versions() -> dict[str, str | int]:
 
 
 @functools.cache
+def learned_with() -> dict[str, str]:
+    """Return the versions of further libraries that decide the bits of training; the manifest leaves them out."""
+    return {name: version(name) for name in ("numpy", "flax", "optax")}
+
+
+@functools.cache
 def device() -> str:
     """Name the kind of device that JAX uses here, such as `cpu: AMD EPYC 7B13`."""
     import jax  # starts JAX's backend, so only on a worker

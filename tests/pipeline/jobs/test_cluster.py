@@ -458,7 +458,8 @@ def test_mismatch_names_what_differs() -> None:
     job = made_job()
     program = program_of(job)
     assert mismatch(program, job) == ""
-    for name, other in (("jax", "0.1"), ("levelproof", "7"), ("configuration", "abc"), ("source", "def")):
+    others = {"jax": "0.1", "optax": "0.1", "levelproof": "7", "configuration": "abc", "source": "def"}
+    for name, other in others.items():
         refusal = mismatch(program | {name: other}, job)
         assert f" has {name} {program[name]}, and this command {name} {other}: install" in refusal
         assert socket.gethostname() in refusal

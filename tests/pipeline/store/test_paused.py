@@ -26,6 +26,7 @@ from levelproof.pipeline.store.locks import only_writer
 from levelproof.pipeline.store.paused import CheckpointUnread, drop_paused, load_paused, prune_paused, save_paused
 from tests.pipeline.made import made_job
 from tests.pipeline.servers import Server, serving_bucket
+from tests.quick import FAST_COMPILING
 
 JOB = made_job("data", "budget=5k")
 UNIT = unit_name(3, 7)
@@ -93,13 +94,25 @@ def test_load_paused_prefers_the_later_checkpoint(split: Path, kept: dict[int, P
     same(load_paused(split, range(8), JOB), {3: kept[7], 7: kept[7]})
 
 
-@pytest.mark.parametrize(("name", "other"), [("versions", {"jax": "another"}), ("device", "cpu: of another kind")])
+@pytest.mark.parametrize(
+    ("name", "other"),
+    [("versions", {"jax": "another"}), ("learned_with", {"optax": "another"}), ("device", "cpu: of another kind")],
+)
 def test_load_paused_ignores_other_settings_and_machines(
     split: Path, name: str, other: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert load_paused(split, range(8), replace(JOB, budget="8k")) == {}
     monkeypatch.setattr(store, name, lambda: other)
     assert load_paused(split, range(8), JOB) == {}
+
+
+def test_load_paused_ignores_experts_of_another_optimiser(split: Path) -> None:
+    before = jax.config.values[FAST_COMPILING]
+    jax.config.update(FAST_COMPILING, not before)
+    try:
+        assert load_paused(split, range(8), JOB) == {}
+    finally:
+        jax.config.update(FAST_COMPILING, before)
 
 
 def test_load_paused_ignores_damaged_checkpoints(split: Path) -> None:
