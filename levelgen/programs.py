@@ -138,7 +138,7 @@ class StoredProgram(Generic[T]):
 
     def _found_or_made(self, call: Call, args: Any, kwargs: Any) -> Any:
         name = f"{self.function.__module__}.{self.function.__qualname__}"
-        request = f"{name} {self.options} {self._settings} {call} {_machine()}"
+        request = f"{name} {self.options} {self._settings} {call} {machine()}"
         # Python's default text of an object contains its address, which differs between processes
         key = None if " at 0x" in request else key_by_sources(request, SOURCES)
         place = stored(key) if key else None
@@ -152,7 +152,7 @@ class StoredProgram(Generic[T]):
             return lowered.compile()
         text = lowered.as_text()
         # The text leaves out arguments that nothing reads, but a loaded program checks the shapes of all
-        described = f"{text} {call.tree} {call.types} {call.settings} {self.options} {_machine()}"
+        described = f"{text} {call.tree} {call.types} {call.settings} {self.options} {machine()}"
         place = "program " + hashlib.sha256(described.encode()).hexdigest()
         if program := _load(place, call):
             store(key, place.encode())
@@ -255,7 +255,7 @@ def _settings() -> tuple[Any, ...]:
     return values["jax_enable_x64"], values["jax_disable_most_optimizations"]
 
 
-def _machine() -> str:
+def machine() -> str:
     """Return what decides compiled code besides the program: present settings, libraries and the processor."""
     values = {name: value for name, value in jax.config.values.items() if "cache" not in name}
     return f"{values} {os.environ.get('XLA_FLAGS')} {_processor()}"

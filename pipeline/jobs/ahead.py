@@ -9,7 +9,9 @@ from levelproof.configs.schema import JobConfig
 from levelproof.experts.pool.pool import Pool
 from levelproof.experts.pool.programs import Program, ids_of, programs_of
 from levelproof.levelgen.level import size_of
+from levelproof.levelgen.programs import SOURCES, machine
 from levelproof.levelgen.sampling.sampler import CHUNK, sample_chunk
+from levelproof.physics.codegen.kept import key_by_sources
 from levelproof.pipeline.claims import try_claim
 from levelproof.pipeline.jobs.likeness import program_of
 from levelproof.pipeline.runtime import cache_folder
@@ -30,8 +32,10 @@ class Ahead:
         search = job.search.scaled(size_of(job.size).bodies)
         of_code = [entry for entry in program_of(job).items() if entry[0] != "configuration"]
         settings = job.size, job.expert, search.endless, search.robustness, job.task, of_code, device()
+        request = f"{settings} {machine()}"
+        key = key_by_sources(request, SOURCES) or request
         self._seconds: list[float] = []  # time of each program that this process has compiled
-        self._programs = {_claim(folder, program, repr(settings)): program for program in programs}
+        self._programs = {_claim(folder, program, key): program for program in programs}
 
     def compile_next(self) -> tuple[int, int] | None:
         """Compile the first program that no process has compiled or compiles now; return `compiled` then.
@@ -78,8 +82,8 @@ def _sampling(job: JobConfig) -> list[Program]:
     return [] if job.level_files else [program]
 
 
-def _claim(folder: Path, program: Program, settings: str) -> Path:
-    return folder / f"{hashlib.sha256(f'{program.name} {settings}'.encode()).hexdigest()}.ahead"
+def _claim(folder: Path, program: Program, key: str) -> Path:
+    return folder / f"{hashlib.sha256(f'{program.name} {key}'.encode()).hexdigest()}.ahead"
 
 
 def _is_done(path: Path) -> bool:

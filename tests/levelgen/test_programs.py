@@ -207,10 +207,10 @@ def test_most_optimisations_can_be_switched_off(folder: Path) -> None:
 
 
 def test_present_settings_are_part_of_a_programs_key(monkeypatch: pytest.MonkeyPatch) -> None:
-    before = programs._machine()
+    before = programs.machine()
     jax.config.update("jax_default_matmul_precision", "highest")
     try:
-        assert programs._machine() != before
+        assert programs.machine() != before
     finally:
         jax.config.update("jax_default_matmul_precision", None)
-    assert programs._machine() == before
+    assert programs.machine() == before

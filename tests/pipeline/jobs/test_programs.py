@@ -93,6 +93,15 @@ def test_ahead_skips_what_another_process_compiles(job: JobConfig, pool: Pool, c
     assert not ahead.left
 
 
+def test_ahead_compiles_again_under_other_flags(
+    job: JobConfig, pool: Pool, claims: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = Ahead(job, pool)._programs.keys()
+    assert before == Ahead(job, pool)._programs.keys()
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_prefer_vector_width=256")
+    assert before.isdisjoint(Ahead(job, pool)._programs)
+
+
 def test_programs_without_optimiser_multiply_no_floats(programs: list[Program]) -> None:
     quick = [program for program in programs if program.function.options == UNOPTIMISED]
     decorated = [path.read_text().count("\n@jit_quickly") for path in (ROOT / "experts").rglob("*.py")]
