@@ -45,7 +45,7 @@ def register(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", default="s", help="default: s")
     parser.add_argument("--budget", default="64k", help="default: 64k")
     parser.add_argument("--levels", type=int, default=1024, help="levels of the job; default: 1024")
-    parser.add_argument("--repeats", type=int, default=2, help="pairs of runs; default: 2")
+    parser.add_argument("--repeats", type=int, default=2, help="pairs of runs, at least 1; default: 2")
 
 
 def run(args: argparse.Namespace) -> Report:

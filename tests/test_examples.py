@@ -74,9 +74,10 @@ def stand_ins(tmp_path: Path) -> dict[str, str]:
 
 def test_kubernetes_example_counts_quarantined_units_as_done(tmp_path: Path, stand_ins: dict[str, str]) -> None:
     command = yaml.safe_load((FOLDER / "kubernetes.yaml").read_text())["spec"]["entrypoint"]
+    quoted = subprocess.list2cmdline(shlex.split(command))  # as Ray did before it used `shlex.join`
     for code, is_done in (0, True), (3, True), (1, False):
         (tmp_path / "codes").write_text(f"{code}\n")
-        done = subprocess.run(["sh", "-c", command], cwd=tmp_path, env=stand_ins, timeout=patience(60))
+        done = subprocess.run(["sh", "-c", quoted], cwd=tmp_path, env=stand_ins, timeout=patience(60))
         assert (done.returncode == 0) == is_done
 
 

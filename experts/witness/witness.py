@@ -55,15 +55,20 @@ def replay(level: Level, action: ArrayLike, rules: TaskParams = DEFAULT_RULES) -
 
     Raises:
         ValueError: there are no levels, or the actions have another shape.
+        TypeError: the actions are no integers.
     """
-    level, actions = expanded(level), np.asarray(action, np.int32)
+    level, actions = expanded(level), np.asarray(action)
     count = len(level)
+    if actions.dtype.kind not in "iub":
+        raise TypeError(f"the actions are {actions.dtype}, but must be integers: convert them")
     if not count or actions.shape != (RECORD_STEPS, ACTIONS, count):
         raise ValueError(
             f"there are {count} levels and actions of shape {actions.shape}: pass at least one level, and actions of "
             f"shape ({RECORD_STEPS}, {ACTIONS}, levels)"
         )
-    record = by_blocks(lambda lanes: replay_block(take(level, lanes), actions[..., lanes], rules), count)
+    record = by_blocks(
+        lambda lanes: replay_block(take(level, lanes), actions[..., lanes].astype(np.int32), rules), count
+    )
     return jax.tree.map(np.ascontiguousarray, record)
 
 

@@ -15,7 +15,7 @@ from levelproof.levelgen.task.observe.kinds import observe as observe_lanes
 from levelproof.physics.types import State
 from levelproof.pipeline.errors import UserError
 
-MIN_ROWS = 1024  # observed at once: fewer are padded
+MIN_ROWS = 1024  # observed at once: fewer are padded, others to a power of two, so that few programs serve all counts
 COMPILING = Lock()  # or threads that need the same new program would each compile it
 T = TypeVar("T")
 
@@ -33,14 +33,15 @@ def observe(kind: ObservationType, level: Level, states: State) -> Any:
     """Observe levels [batch, ...] in states [batch, time, ...]; return numpy arrays [batch, time, ...]."""
     count = len(level.role)
     with COMPILING:
-        shown = _observe(kind, *_padded((level, states), _power_of_two(count)))
+        shown = _observe(kind, *_padded((level, states), _rounded(count)))
     return jax.tree.map(lambda x: x[:count], jax.device_get(shown))
 
 
 def observe_rows(kind: ObservationType, level: Level, row_level: Int[np.ndarray, " row"], states: State) -> Any:
     """Observe states [row, ...], each in its level of several [level, ...]; return numpy arrays [row, ...]."""
     count = len(row_level)
-    row_level, states = _padded((row_level, states), max(MIN_ROWS, _power_of_two(count)))
+    padded = max(MIN_ROWS, 1 << (count - 1).bit_length())
+    row_level, states = _padded((row_level, states), padded)
     with COMPILING:
         made = _observe_rows(kind, level, row_level, states)
     constant, changing = jax.device_get(made)
@@ -62,9 +63,10 @@ def _observe_rows(kind: ObservationType, level: Level, row_level: Any, states: S
     return constant_features(kind, level).T, jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), changing)
 
 
-def _power_of_two(count: int) -> int:
-    """Return the least power of two that is not less than `count`, so that few programs serve all counts."""
-    return 1 << (count - 1).bit_length()
+def _rounded(count: int) -> int:
+    """Return a count at most an eighth larger, so that few programs serve all counts: eight for each doubling."""
+    step = 1 << max(count.bit_length() - 4, 0)
+    return -(-count // step) * step
 
 
 def _padded(tree: T, count: int) -> T:

@@ -121,7 +121,7 @@ def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board
             try:
                 settle(outcomes)
             except Exception:
-                board.say("This job fails, once decided levels are committed.")
+                board.say("This job cannot continue: it ends once its workers have committed what they can.")
                 with suppress(Exception):  # the first failure counts
                     settle(crew.leave(GRACE))
                 raise

@@ -33,7 +33,7 @@ def mismatch(program: Program, job: JobConfig) -> str:
         if here.get(name) != there:
             return (
                 f"The worker on {socket.gethostname()} has {name} {here.get(name, 'unknown')}, and this command {name} "
-                f"{there}: install the same versions there, start its Ray again, and run the same command."
+                f"{there}: install the same levelproof and libraries there, restart its Ray, and run the same command."
             )
     return ""
 

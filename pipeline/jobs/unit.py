@@ -92,7 +92,8 @@ def failure(split: Path, unit: WorkUnit, error: Exception) -> UnitOutcome:
         fatal = str(error)
     elif isinstance(error, OSError) and (sentence := refusal(error, written_disk(split))):
         fatal = f"{sentence}."
-    return UnitOutcome(unit, reason=reason, fatal=fatal, kind=UserError if isinstance(error, UserError) else Failure)
+    kind = next((kind for kind in (UserError, StoreFailure) if isinstance(error, kind)), Failure)
+    return UnitOutcome(unit, reason=reason, fatal=fatal, kind=kind)
 
 
 def check_witnesses(result: UnitResult, task: TaskParams) -> None:

@@ -21,6 +21,7 @@ from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.learn.measured import MeasuredLevels, is_split, levels_in, midway_levels
 from levelproof.pipeline.learn.sealed import require_not_sealed, require_some_usable, without_sealed
+from levelproof.pipeline.read.level_files import rule_settings
 from levelproof.pipeline.store.remote import is_remote
 
 
@@ -61,6 +62,8 @@ def levels_for(config: TrainConfig, tell: Callable[[str], None]) -> TrainingLeve
     if len(groups) > 1:
         midway = b"".join(np.asarray(group.levels.state.position).tobytes() for group in groups[1:])
         facts["states"] = hashlib.sha256(midway).hexdigest()[:16]
+    if other := rule_settings(groups[0].rules):
+        facts["rules"] = other
     return TrainingLevels(str(place), levels, groups[0].rules, facts)
 
 

@@ -25,10 +25,9 @@ from levelproof.experts.verdict.judge import repeated
 from levelproof.experts.witness.success import Success
 from levelproof.experts.witness.witness import replay
 from levelproof.levelgen.batching import take
-from levelproof.levelgen.level import Level
+from levelproof.levelgen.level import Level, concatenate_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 from tests.experts.search.worlds import broken, switchback, tower, valley
-from tests.experts.search.worlds import side_by_side as together
 
 CONFIG = SearchConfig(env_steps=262_144, variations=65_536, patience_gap=0, lanes=32, entries=128)
 ROUND = CONFIG.lanes * CONFIG.segments * CONFIG.segment  # env steps
@@ -49,7 +48,7 @@ def search(levels: Level, level_ids: np.ndarray, config: SearchConfig, rules: Ta
 
 @cache
 def levels() -> Level:
-    return take(together(switchback(), valley(), broken()), KINDS)
+    return take(concatenate_levels([switchback(), valley(), broken()]), KINDS)
 
 
 @cache
@@ -85,7 +84,9 @@ def test_search_finds_what_random_play_does_not() -> None:
     """In every level the search needs a fraction of its env steps; random play finds almost nothing in as many."""
     assert (found().success.length[SOLVABLE] > 0).all()
     assert (found().env_steps[SOLVABLE] < CONFIG.env_steps).all()
-    twice = take(together(switchback(), valley()), np.array([0, 1, 0, 1]))  # four levels, as where a tower is toppled
+    twice = take(
+        concatenate_levels([switchback(), valley()]), np.array([0, 1, 0, 1])
+    )  # four levels, as where a tower is toppled
     episodes = CONFIG.env_steps // 256 // 256
     wins = sum(random_play(twice, jax.random.key(i)).sum(-1) for i in range(episodes // 2))
     np.testing.assert_array_equal(wins, 0)

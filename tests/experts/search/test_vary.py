@@ -30,10 +30,9 @@ from levelproof.experts.search.vary import (
 )
 from levelproof.experts.witness.witness import replay
 from levelproof.levelgen.batching import take
-from levelproof.levelgen.level import ACTIONS, MOTOR_BINDINGS, Level
+from levelproof.levelgen.level import ACTIONS, MOTOR_BINDINGS, Level, concatenate_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from tests.experts.search.worlds import broken, cannon
-from tests.experts.search.worlds import side_by_side as together
 
 CONFIG = SearchConfig(env_steps=2048, variations=131_072, patience=0, lanes=32, entries=128)
 WIDTH = side_by_side(CONFIG)
@@ -44,7 +43,7 @@ ROUND = CONFIG.steps_per_round  # env steps
 
 @cache
 def levels() -> Level:
-    return take(together(cannon(), broken()), BROKEN.astype(int))
+    return take(concatenate_levels([cannon(), broken()]), BROKEN.astype(int))
 
 
 def misses() -> Approaches:

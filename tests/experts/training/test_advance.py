@@ -12,8 +12,8 @@ from levelproof.experts.training import advance, rollout
 from levelproof.experts.training.slots import Slot, Training
 from levelproof.experts.witness.success import Success
 from levelproof.levelgen.batching import repeat
-from levelproof.levelgen.level import ACTIONS
-from tests.experts.search.worlds import BALL, side_by_side, valley
+from levelproof.levelgen.level import ACTIONS, concatenate_levels
+from tests.experts.search.worlds import BALL, valley
 from tests.experts.small import CONFIG
 from tests.quick import jit_once
 
@@ -42,7 +42,7 @@ def test_lanes_act_as_the_mode_of_their_slot_says() -> None:
 
 def test_perturbed_attempts_start_with_slightly_other_velocities() -> None:
     """Each with its own, of bodies that can move alone; all other lanes start as the level does."""
-    levels, keys = side_by_side(valley(), valley()), jax.random.split(jax.random.key(0), 2)
+    levels, keys = concatenate_levels([valley(), valley()]), jax.random.split(jax.random.key(0), 2)
 
     @jit_once
     def starts() -> tuple:

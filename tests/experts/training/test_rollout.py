@@ -11,10 +11,10 @@ from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.policy import initial, network_of
 from levelproof.experts.training.rollout import ActionRule, Trajectory, rollout, start
 from levelproof.levelgen.batching import repeat
-from levelproof.levelgen.level import ACTIONS, MOTOR_BINDINGS
+from levelproof.levelgen.level import ACTIONS, MOTOR_BINDINGS, concatenate_levels
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.levelgen.task.rules import TaskParams
-from tests.experts.search.worlds import SIZE, side_by_side, valley
+from tests.experts.search.worlds import SIZE, valley
 from tests.experts.small import CONFIG
 
 GREEDY, STICKY, REHEARSING, SAMPLING = range(4)  # environments of each level
@@ -31,7 +31,7 @@ def manner() -> ActionRule:
 @pytest.fixture(scope="module")
 def played() -> Trajectory:
     """Play both levels; before the first step, the last action was to fire both thrusters."""
-    levels, network = side_by_side(valley(), valley()), network_of(SIZE, CONFIG)
+    levels, network = concatenate_levels([valley(), valley()]), network_of(SIZE, CONFIG)
     first = lambda: jax.tree.map(lambda x: x[..., 0], network.constant(levels))
     shapes = jax.eval_shape(lambda: initial(jax.random.key(0), network, first()))
     params = jax.tree.map(lambda x: np.zeros((LEVELS, *x.shape), np.float32), shapes)

@@ -42,6 +42,11 @@ def test_replay_refuses_actions_of_another_shape(shape: tuple[int, ...]) -> None
         replay(sample_levels(np.arange(4), "s"), np.zeros(shape, int))
 
 
+def test_replay_refuses_actions_of_another_type() -> None:
+    with pytest.raises(TypeError, match="the actions are float64, but must be integers"):
+        replay(sample_levels(np.arange(4), "s"), np.zeros((RECORD_STEPS, ACTIONS, 4)))
+
+
 def test_replay_takes_arrays_that_all_levels_share() -> None:
     levels, actions = sample_levels(np.arange(4), "s"), np.ones((RECORD_STEPS, ACTIONS, 4), int)
     shared = replace(levels, model=replace(levels.model, gravity=np.array([[0.0], [-1.6]], np.float32)))

@@ -3,6 +3,7 @@
 import json
 import shutil
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,9 @@ from levelproof.levelgen.task.lanes import FIRST_EXTRA
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.exchange.level_json import export
 from levelproof.pipeline.learn import run as writer
-from levelproof.pipeline.learn import sealed
+from levelproof.pipeline.learn import sealed, trained_on
 from levelproof.pipeline.learn import train as module
+from levelproof.pipeline.learn.measured import levels_in
 from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.trained_on import levels_for
 from tests.pace import patience, wait_until
@@ -267,6 +269,12 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     of_files = levels_for(TrainConfig(levels=str(tmp_path)), messages.append)
     assert of_files.facts["count"] == 1
     assert not messages
+    with monkeypatch.context() as patch:
+        [group] = levels_in(split, "label = 'solved'", None, print)
+        ruled = group._replace(rules=replace(group.rules, dense_reward_scale=0.5))
+        patch.setattr(trained_on, "_groups", lambda *_: [ruled])
+        facts = levels_for(TrainConfig(levels=str(split), where="label = 'solved'"), print).facts
+    assert facts == source.facts | {"rules": [*source.facts.get("rules", []), "task.dense_reward_scale=0.5"]}
     (tmp_path / "two").mkdir()
     shutil.copy(tmp_path / "level.json", tmp_path / "two")
     write_level_file(LevelFile(empty_level(SIZES["m"], 1), DEFAULT_RULES), tmp_path / "two/m.json")
