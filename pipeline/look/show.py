@@ -139,7 +139,7 @@ GOAL, FAIL, LATE, BROKEN = "goal reached", "touched red", "time is up", "world b
 
 def do_nothing(level: Level, rules: TaskParams) -> tuple[Record, End]:
     """Record doing nothing; return the record and how its first episode ends."""
-    record = replay(level, np.zeros((RECORD_STEPS, ACTIONS, 1)), replace(rules, dense_reward_scale=0.0))
+    record = replay(level, np.zeros((RECORD_STEPS, ACTIONS, 1), np.int32), replace(rules, dense_reward_scale=0.0))
     if not record.done.any():
         return record, (RECORD_STEPS, "")
     steps = int(steps_to_goal(record.done)[0])

@@ -186,7 +186,8 @@ def test_episodes_of_seeds_end_where_they_were_stored_to_end(honest: Path, tmp_p
 
 
 def test_seeds_are_not_made_of_states_that_differ(shards: Path, ids: list[int], tmp_path: Path) -> None:
-    with pytest.raises(Failure, match=rf'leave them out with `levelproof export --format seed --where "level_id NOT IN \({ids[0]}, {ids[1]}\)"'):
+    advice = rf'leave them out with `levelproof export --format seed --where "level_id NOT IN \({ids[0]}, {ids[1]}\)"`'
+    with pytest.raises(Failure, match=advice):
         export_seed(shards, None, tmp_path / "seeds.parquet")
     assert not (tmp_path / "seeds.parquet").exists()
     export_seed(shards, f"level_id NOT IN ({ids[0]}, {ids[1]})", tmp_path / "seeds.parquet")
