@@ -55,7 +55,7 @@ def replay(level: Level, action: ArrayLike, rules: TaskParams = DEFAULT_RULES) -
 
     Raises:
         ValueError: there are no levels, or the actions have another shape.
-        TypeError: the actions are no integers.
+        TypeError: the actions are not integers.
     """
     level, actions = expanded(level), np.asarray(action)
     count = len(level)
@@ -66,9 +66,8 @@ def replay(level: Level, action: ArrayLike, rules: TaskParams = DEFAULT_RULES) -
             f"there are {count} levels and actions of shape {actions.shape}: pass at least one level, and actions of "
             f"shape ({RECORD_STEPS}, {ACTIONS}, levels)"
         )
-    record = by_blocks(
-        lambda lanes: replay_block(take(level, lanes), actions[..., lanes].astype(np.int32), rules), count
-    )
+    actions = actions.astype(np.int32, copy=False)
+    record = by_blocks(lambda lanes: replay_block(take(level, lanes), actions[..., lanes], rules), count)
     return jax.tree.map(np.ascontiguousarray, record)
 
 

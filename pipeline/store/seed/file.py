@@ -87,15 +87,14 @@ def written(path: Path) -> tuple[int, ...] | None:
 
 
 def read_seed(
-    path: Path, names: Sequence[str], level_ids: np.ndarray | None = None, compact: bool = False
+    path: Path, names: Sequence[str], compact: bool = False, at: np.ndarray | None = None
 ) -> tuple[SeedFile, pa.Table]:
-    """Read columns of a seed file, of all rows or, with `level_ids` (ascending), of these levels' row groups at least.
+    """Read columns of a seed file, of all rows or, with `at` (from `find_levels`), at least of those positions.
 
     Raises:
         UserError: it is not a seed file.
         Failure: it is missing, damaged, or has another version.
     """
-    at = None if level_ids is None else find_levels(path, level_ids)[1]
     with _opened(path) as (about, file, stored_as):
         table = file.read(list(dict.fromkeys(["level_id", *names])), stored_as, compact=compact, at=at)
         _check(table)

@@ -73,7 +73,7 @@ def _rows(path: Path, names: Sequence[str], level_ids: np.ndarray | None) -> tup
         about, at = find_levels(path, level_ids)
         if not len(at):
             return about, pa.table({})
-        rows = read_seed(path, names, level_ids, compact=True)[1]
+        rows = read_seed(path, names, compact=True, at=at)[1]
         rows = rows.filter(np.isin(rows.column("level_id").to_numpy(), level_ids))
     return about, rows.append_column("row", pa.array(at, pa.int32()))
 

@@ -18,7 +18,14 @@ from levelproof.pipeline.store.density import Restored
 from levelproof.pipeline.store.fields import arrays_of
 from levelproof.pipeline.store.formats import FIRST_VERSION, Encoding, FieldSpec
 from levelproof.pipeline.store.mapped import find_table, share_table, whole
-from levelproof.pipeline.store.seed.file import damaged_seed, describe_seed, name_of_table, read_seed, seed_files
+from levelproof.pipeline.store.seed.file import (
+    damaged_seed,
+    describe_seed,
+    find_levels,
+    name_of_table,
+    read_seed,
+    seed_files,
+)
 from levelproof.pipeline.store.seed.packed import unpack_witnesses
 from levelproof.pipeline.store.seed.source import LevelSource
 from levelproof.pipeline.store.shard import Part, Shard
@@ -136,8 +143,8 @@ def stored_levels(source: Path, level_ids: np.ndarray) -> Level:
     contents: dict[int, bytes | None] = {}
     config = None
     for path in seed_files(source):
-        about, rows = read_seed(path, ["content"], np.sort(level_ids))
-        config = about.fragment.config
+        about, at = find_levels(path, level_ids)
+        config, rows = about.fragment.config, read_seed(path, ["content"], at=at)[1]
         contents |= dict(zip(rows.column("level_id").to_pylist(), rows.column("content").to_pylist(), strict=True))
     return LevelSource.of(config or {}, source).levels(level_ids, [contents.get(i) for i in level_ids.tolist()])
 
