@@ -12,7 +12,7 @@ from levelproof.configs.schema import Density
 from levelproof.pipeline.jobs.seal import seal_split
 from levelproof.pipeline.store.layout import JOB
 from levelproof.pipeline.store.locks import without_commits
-from levelproof.pipeline.store.manifest import fragment_paths, read_fragment
+from levelproof.pipeline.store.manifest import fragment_paths, read_fragment, write_index
 from levelproof.pipeline.store.mend import take_out
 from levelproof.pipeline.verify.findings import Findings
 from levelproof.pipeline.verify.verify import examine
@@ -40,6 +40,7 @@ def mixed(unsealed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     seal_split(split, 8, Console(quiet=True))
     for path in kept:
         (later / path.name).rename(path)
+    write_index(split)
     assert len(fragment_paths(split)) == 4
     return split
 
