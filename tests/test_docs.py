@@ -90,6 +90,7 @@ def test_notebook_runs_from_top_to_bottom(
             exec(compile(source, str(page), "exec"), names)
 
 
+@pytest.mark.slow
 def test_docs_build_without_a_broken_link(tmp_path: Path) -> None:
     words = ["-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}

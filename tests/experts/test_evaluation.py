@@ -138,6 +138,7 @@ def test_players_draw_as_they_say(levels: Level) -> None:
     assert not np.asarray(do_nothing((), moment)).any()
 
 
+@pytest.mark.slow
 def test_policy_plays_by_its_logits(levels: Level) -> None:
     """Against numpy's softmax of each entry's logits, drawn by inversion."""
     network, lanes = NetworkConfig(PolicyKind.ATTENTION, width=8, depth=1, heads=2), len(IDS)

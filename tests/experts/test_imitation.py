@@ -60,6 +60,7 @@ def test_loss_and_accuracy_are_means_over_live_entries_then_over_transitions() -
     assert (float(other.loss), float(other.accuracy)) == (float(likeness.loss), float(likeness.accuracy))
 
 
+@pytest.mark.slow
 def test_update_is_the_same_in_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     levels = jax.tree.map(np.asarray, sample_levels(np.arange(COUNT), "s"))
     action = np.random.default_rng(0).integers(0, CHOICES, (COUNT, len(CHOICES))).astype(np.int32)

@@ -23,6 +23,7 @@ def after(seed: int = 1) -> list[Any]:
     return [np.asarray(x) for x in jax.tree.leaves(step(*scattered(ROOM, 64, seed)))]  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     sys.platform != "linux" or platform.machine() != "x86_64", reason="RuntimeDyld corrupts memory elsewhere"
 )

@@ -89,6 +89,7 @@ def test_full_disk_below_stdout_is_an_error(split: Path) -> None:
     assert done.stderr.startswith("Error: OSError")
 
 
+@pytest.mark.slow
 def test_full_disk_below_stderr_ends_no_command(split: Path, tmp_path: Path) -> None:
     """Messages are lost, but neither results nor the exit code."""
     with open("/dev/full", "w") as full:

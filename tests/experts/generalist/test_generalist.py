@@ -52,7 +52,7 @@ def test_discount_counts_env_steps_whatever_an_action_lasts() -> None:
     np.testing.assert_allclose(_advantages(lane, longer), _advantages(lane, CONFIG), rtol=1e-6)
 
 
-@pytest.mark.parametrize("repeat", [1, 3])
+@pytest.mark.parametrize("repeat", [pytest.param(1, marks=pytest.mark.slow), 3])
 def test_repeated_action_equals_that_many_env_steps(repeat: int) -> None:
     """The same world, and the same reward after the first action, whose shaping is 0; the same lanes end."""
     config = PPOConfig(repeat=repeat, dense_reward_scale=0.3)

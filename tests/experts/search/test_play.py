@@ -5,6 +5,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from levelproof.experts.search.play import Arena, Walk, arena, decode, encode, fresh_walk, play
 from levelproof.experts.search.rows import from_rows, to_rows
@@ -48,6 +49,7 @@ def test_rows_round_trip_states_exactly() -> None:
     jax.tree.map(np.testing.assert_array_equal, back, noisy)
 
 
+@pytest.mark.slow
 def test_play_ends_episodes_as_the_task_does() -> None:
     """Goal, failure, time limit and broken worlds come at the same env step, after the same states."""
     ring, bits = ring_of_all(), random_bits(3)

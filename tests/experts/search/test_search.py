@@ -80,6 +80,7 @@ def random_play(levels: Level, key: jax.Array) -> jax.Array:
     return play(ring, fresh_walk(ring.lanes), bits, DEFAULT_RULES)[0].reached.reshape(-1, 256) > 0
 
 
+@pytest.mark.slow
 def test_search_finds_what_random_play_does_not() -> None:
     """In every level the search needs a fraction of its env steps; random play finds almost nothing in as many."""
     assert (found().success.length[SOLVABLE] > 0).all()
@@ -92,6 +93,7 @@ def test_search_finds_what_random_play_does_not() -> None:
     np.testing.assert_array_equal(wins, 0)
 
 
+@pytest.mark.slow
 def test_search_topples_a_tower() -> None:
     """The search topples it on some levels; random play does in fewer than one episode in a thousand."""
     four = take(tower(), np.zeros(4, int))

@@ -80,6 +80,7 @@ def test_variations_turn_near_misses_into_successes() -> None:
     assert record.goal[length[at] - 1, np.arange(len(at))].all()
 
 
+@pytest.mark.slow
 def test_search_runs_variations_after_go_explore() -> None:
     """Go-Explore is too short to succeed, then variations follow; both count their env steps."""
     searching = Searching(CONFIG, DEFAULT_RULES)

@@ -57,6 +57,7 @@ def test_success_rate_differs_from_that_of_the_last_evaluation(run: TrainingRun,
     assert 0.5 < rates.mean() < 1
 
 
+@pytest.mark.slow
 def test_attempts_add_their_env_steps(run: TrainingRun, result: UnitResult) -> None:
     assert run.submission
     for index, level in zip(run.left, run.submission.trained(CONFIG), strict=True):
@@ -68,6 +69,7 @@ def test_attempts_add_their_env_steps(run: TrainingRun, result: UnitResult) -> N
     assert min(seconds) > 0
 
 
+@pytest.mark.slow
 def test_attempts_count_first_episodes_alone(levels: Level, run: TrainingRun) -> None:
     """An expert without preferences fires thrusters at random. Some attempts reach the goal in a later episode only."""
     loose = replace(levels, model=replace(levels.model, joint_active=np.zeros_like(levels.model.joint_active)))

@@ -15,7 +15,7 @@ RULES = TaskParams(max_timesteps=150)
 NAMES = frozenset({"reward", "goal", "timestep", "state/position", "manifold/penetration"})
 
 
-@pytest.mark.parametrize("count", [40, AT_ONCE + 8])
+@pytest.mark.parametrize("count", [40, pytest.param(AT_ONCE + 8, marks=pytest.mark.slow)])
 def test_played_episodes_are_the_first_of_their_records(count: int) -> None:
     """40 episodes are more than the lanes that few have, and AT_ONCE + 8 are played in two groups."""
     level, rng = sample_levels(np.arange(count), "s"), np.random.default_rng(0)

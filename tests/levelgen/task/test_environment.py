@@ -300,6 +300,7 @@ def test_make_refuses_no_levels(levels: Level) -> None:
         make(jax.tree.map(lambda x: x[..., :0], levels))
 
 
+@pytest.mark.slow
 def test_equal_settings_share_programs_which_keep_no_levels(levels: Level) -> None:
     made = []
     for some in levels[:4], levels[4:8]:

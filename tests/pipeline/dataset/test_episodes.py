@@ -59,6 +59,7 @@ def test_episodes_of_seeds_are_those_of_their_split(honest: Path, seeds: Path, o
     assert_same(mine, jax.tree.map(np.asarray, split.__class__(**{**vars(split), "action": mine.action})))
 
 
+@pytest.mark.slow
 def test_episodes_have_the_same_bits_however_many_are_played_together(
     seeds: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

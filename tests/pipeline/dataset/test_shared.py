@@ -86,6 +86,7 @@ def in_worker(pickled: bytes) -> tuple[list[list], list[int]]:
     return rows, sorted({int(line.split()[4]) for line in maps if line.endswith(mapped.SUFFIX)})
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="this system does not list maps")
 def test_processes_of_a_loader_map_the_same_files(seeds: Path, folder: Path) -> None:
     data = levelproof.open(seeds, where=WHERE)
@@ -126,6 +127,7 @@ def open_first(path: Path, cache: Path) -> list[list]:
     return all_rows(levelproof.open(path))
 
 
+@pytest.mark.slow
 def test_concurrent_first_opens_do_not_conflict(seeds: Path, folder: Path) -> None:
     with ProcessPoolExecutor(3, multiprocessing.get_context("spawn")) as workers:
         first, *others = workers.map(open_first, [seeds] * 6, [folder.parent] * 6)

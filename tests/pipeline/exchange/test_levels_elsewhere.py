@@ -89,6 +89,7 @@ def test_file_without_levels_keeps_everything_else(whole: Path, lacking: Path) -
     assert lacking.stat().st_size < whole.stat().st_size
 
 
+@pytest.mark.slow
 def test_levels_are_added_again_from_files_of_any_name(
     whole: Path, lacking: Path, folder: Path, tmp_path: Path
 ) -> None:

@@ -270,6 +270,7 @@ def test_transformer_learns_from_states_with_their_contacts(split: Path) -> None
     )
 
 
+@pytest.mark.slow
 def test_pool_has_the_mirror_images_that_solve(split: Path) -> None:
     config = CloneConfig(where="label = 'solved'", mirror=True)
     data = module.source_of(split, replace(config, validation=0.3), print).data

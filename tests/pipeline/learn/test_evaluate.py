@@ -273,6 +273,7 @@ def test_command_refuses_a_policy_of_another_size(tmp_path: Path) -> None:
     assert_refused(here(["evaluate", str(policy), "--levels", "8"], tmp_path), 2, "plays levels of size m only")
 
 
+@pytest.mark.slow
 def test_each_look_at_the_sealed_levels_is_logged(tmp_path: Path) -> None:
     policy = policy_in(tmp_path, PolicyKind.FLAT, "s")  # compiles fastest
     for look in (1, 2):

@@ -156,6 +156,7 @@ def test_train_request_streams_progress(page: ClientConnection, monkeypatch: pyt
     assert ask(page, "play")["actions"] == film["actions"]
 
 
+@pytest.mark.slow
 def test_policy_attempts_are_played_from_the_start(split: Path) -> None:
     """Another attempt each time; a success is the level's witness, as if the user had played it."""
     row = next(row for row in require_manifest(split).table.to_pylist() if row["shard"])

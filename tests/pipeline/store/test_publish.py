@@ -133,6 +133,7 @@ def test_store_gets_what_a_folder_gets(server: Server, here: Path, every: int, h
     assert not [line for line in server.log[count:] if line.startswith("PUT") and "/shards/" in line]
 
 
+@pytest.mark.slow
 def test_requests_to_a_slow_store_are_retried(server: Server, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(requests.PATIENCE, "read_timeout", timedelta(seconds=patience(0.5)))
     forget()

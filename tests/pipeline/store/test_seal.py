@@ -277,6 +277,7 @@ def test_seal_survives_any_commits_and_kills(made: Path, tmp_path: Path, steps: 
     assert_tidy(split, bool(there))
 
 
+@pytest.mark.slow
 def test_active_readers_survive_a_seal(split: Path, made: Path) -> None:
     """They see every level once at any time, and read its data wherever it lies."""
     expected, ended, passed = whole(made), threading.Event(), threading.Semaphore(0)

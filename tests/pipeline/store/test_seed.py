@@ -203,7 +203,7 @@ def assert_same_batch(ours: Batch, theirs: Batch) -> None:
         (None, None, {}),
         (None, 5, {"process_index": 1, "process_count": 2}),
         (100, 3, {"subset": "train"}),
-        (20, None, {}),  # shorter than most first episodes
+        pytest.param(20, None, {}, marks=pytest.mark.slow),  # shorter than most first episodes
     ],
 )
 def test_batches_of_seeds_are_those_of_the_split_that_they_grow_into(
@@ -288,6 +288,7 @@ def rewritten(seed: Path, path: Path, **columns: Any) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_grow_leaves_out_levels_whose_bits_differ(
     seed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -89,6 +89,7 @@ def test_commands_that_write_leave_a_folder_of_seed_files_as_it_is(seed: Path, t
     assert seed.read_bytes() == whole
 
 
+@pytest.mark.slow
 def test_verify_finds_no_fault_in_a_seed_file_and_every_change_of_its_bytes(seed: Path, tmp_path: Path) -> None:
     findings = examine(seed)
     assert (findings.wrong, findings.levels) == ({}, 16)
@@ -152,6 +153,7 @@ def test_seed_files_and_what_is_grown_from_them_are_not_repaired(
         assert_refused(here(["verify", source, "--repair", INLINE], tmp_path), 2, told)
 
 
+@pytest.mark.slow
 def test_gallery_show_and_export_of_a_seed_file_are_those_of_its_split(split: Path, seed: Path, tmp_path: Path) -> None:
     level_id = str(read_manifest(seed, []).level_ids[solved(seed)])
 

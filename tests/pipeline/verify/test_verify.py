@@ -111,6 +111,7 @@ def test_examine_compares_the_index_for_web_servers_with_the_fragments(split: Pa
     assert_reported(split, f"The index {index} differs from the fragments there: `levelproof seal` writes it anew")
 
 
+@pytest.mark.slow
 def test_examine_reports_a_failing_server_as_such_and_not_as_damage(
     split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -19,7 +19,9 @@ def draw(level: Level) -> np.ndarray:
     return 255 * np.asarray(image)
 
 
-@pytest.mark.parametrize("size", ["s", "m", pytest.param("l", marks=pytest.mark.campaign)])
+@pytest.mark.parametrize(
+    "size", ["s", pytest.param("m", marks=pytest.mark.slow), pytest.param("l", marks=pytest.mark.campaign)]
+)
 def test_pixels_equal_the_references(size: str) -> None:
     seen = load_seen(size)
     ours = draw(seen.level)
