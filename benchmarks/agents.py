@@ -11,9 +11,11 @@ from benchmarks.cloning import SAMPLED, command, interval_text
 from benchmarks.published import write
 from benchmarks.report import Report, Table
 from levelproof.experts.networks.saved import WEIGHTS, load_policy, policy_folder
+from levelproof.levelgen.identity.keys import SAMPLER_VERSION
 from levelproof.levelgen.level import SIZES
+from levelproof.physics.step import ENGINE_VERSION
 from levelproof.pipeline.learn.evaluate import ALL
-from levelproof.pipeline.learn.published import AGENTS, HANDMADE, PROTOCOLS, RANDOM
+from levelproof.pipeline.learn.published import AGENTS, HANDMADE, PROTOCOLS, RANDOM, random_file
 from levelproof.pipeline.read.policies import policy_at
 
 BASELINES = ("doing nothing", "random", "sticky random")
@@ -41,9 +43,9 @@ def run(args: argparse.Namespace) -> Report:
         "Shares of levels solved by sampled actions, first episode only, mean over "
         f"{PROTOCOLS[RANDOM].attempts} attempts at a random level and {PROTOCOLS[HANDMADE].attempts} at a handmade "
         "one: the protocol of the reference (kinetix-env 3.0.2), whose README has the rates of `sfl-paper` and "
-        "`sfl-1m-envs`. The levels are the reference's; our policies play in our engine. Unsolvable levels count. "
-        "Brackets: 95% intervals over levels; the published rates have none, and this is not the first look at these "
-        "levels.",
+        "`sfl-1m-envs`. The levels are those that the reference makes here (some of m and l differ by machine); our "
+        "policies play in our engine. Unsolvable levels count. Brackets: 95% intervals over levels; the published "
+        "rates have none, and this is not the first look at these levels.",
         "Env steps are those played in training by reinforcement learning, without measurements of learnability or "
         "searches for demonstrations; `builtin:s` and `builtin:m` used neither.",
         *(
@@ -58,7 +60,10 @@ def run(args: argparse.Namespace) -> Report:
 
 def evaluated(args: argparse.Namespace, policy: str, on: str, size: str) -> dict[str, Any]:
     """Return a policy's evaluation on the levels of a size, from its file if an earlier run made it."""
-    digest = hashlib.sha256((policy_folder(policy) / WEIGHTS).read_bytes()).hexdigest()[:12]
+    made_of = repr((ENGINE_VERSION, SAMPLER_VERSION)).encode() + (policy_folder(policy) / WEIGHTS).read_bytes()
+    if on == RANDOM:
+        made_of += random_file(size).read_bytes()  # some of m and l differ between machines
+    digest = hashlib.sha256(made_of).hexdigest()[:12]
     file = args.folder / f"{digest}-{on}-{size}-{args.levels or 'all'}.json"
     if not file.exists():
         some = ("--levels", args.levels) if args.levels else ()

@@ -24,7 +24,9 @@ import levelproof
 from benchmarks.plotting import pyplot, save
 from benchmarks.report import Report, Table
 from levelproof.experts.networks.saved import WEIGHTS, policy_folder
+from levelproof.levelgen.identity.keys import SAMPLER_VERSION
 from levelproof.levelgen.level import name_of
+from levelproof.physics.step import ENGINE_VERSION
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.learn.evaluate import ALL, SOLVED
 from levelproof.pipeline.runtime import own_cores
@@ -132,9 +134,10 @@ def measured(args: argparse.Namespace, size: str, last: int, variant: str, count
 
 
 def kept(file: Path, policy: Path | str, *words: Any) -> dict[str, Any]:
-    """Return an evaluation's rates, from its file if an earlier run made it with the same arguments and weights."""
+    """Return an evaluation's rates, from its file if a run of the same arguments, weights and versions made it."""
     weights = policy_folder(policy) / WEIGHTS  # an agent in a Python file has none
-    told = hashlib.sha256(" ".join(map(str, words)).encode() + (weights.read_bytes() if weights.exists() else b""))
+    told = hashlib.sha256(repr((ENGINE_VERSION, SAMPLER_VERSION, *map(str, words))).encode())
+    told.update(weights.read_bytes() if weights.exists() else b"")
     file = file.with_stem(f"{file.stem}-{told.hexdigest()[:8]}")
     if not file.exists():
         write(file, command("evaluate", policy, *words, "--json").encode())

@@ -132,8 +132,8 @@ def run(args: argparse.Namespace) -> Report:
             f"{f'; what {START} took is not counted' if any(WAYS[way].start == START for way in shown) else ''}. "
             "*Pace*: env steps that training from scratch on s takes in a CPU second of the core, with the learner of "
             f"that day. A core-second here is the CPU time of {PACE:,.0f} of them, so seconds of different paces are "
-            "comparable: RL on random levels takes as many env steps in them, to some 5%"
-            f"{'; curricula took up to 17% fewer at lower paces' if args.size == 's' else ''}. *Of all*: "
+            "comparable: at lower paces, RL on random levels takes up to 11% fewer env steps in them"
+            f"{', and curricula up to 17% fewer' if args.size == 's' else ''}. *Of all*: "
             f"{players[ALL]['random']['levels']:,} levels, of which some cannot be solved; *of solved*, and the best "
             f"of 8 attempts at them: the {players[SOLVED]['random']['levels']:,} that are labelled solved.",
             *[f"*Teachers*: half of the clone's updates are of `levelproof distill {' '.join(DISTILLING)}`."]

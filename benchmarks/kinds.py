@@ -38,6 +38,7 @@ from levelproof.pipeline.learn.clone import size_for, source_of
 from levelproof.pipeline.learn.evaluate import SOLVED
 from levelproof.pipeline.learn.pool import PartedSplit, read_pool
 from levelproof.pipeline.runtime import own_cores, prepare_jax
+from levelproof.pipeline.store.provenance import device, versions
 
 FEW, REPEATS, DRAWN = 2, 5, 100  # updates at once, how often, and batches drawn
 EXPERTS, BASELINES = "experts' own", ("random", "sticky random")
@@ -149,12 +150,16 @@ def kept_speeds(args: argparse.Namespace) -> dict[str, Any]:
     """Return what `speeds` finds, from its file if an earlier run measured the same."""
     args.folder.mkdir(parents=True, exist_ok=True)
     file = args.folder / "speeds.json"
-    of = [str(args.split), args.set, {name: [*KINDS[name].settings] for name in args.kinds}]
+    settings = {name: [*KINDS[name].settings] for name in args.kinds}
+    of = [str(args.split), args.set, settings, device(), versions()]
     if not file.exists():
         file.write_text(json.dumps({"of": of, "found": speeds(args)}))
     kept = json.loads(file.read_text())
     if kept["of"] != of:
-        raise UserError(f"{args.folder} has another command's networks, settings or split: choose another --folder.")
+        raise UserError(
+            f"{args.folder} has speeds of another machine, or of other networks, settings or levels: choose another "
+            "--folder."
+        )
     return kept["found"]
 
 
