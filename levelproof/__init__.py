@@ -9,6 +9,8 @@ import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+if os.name == "nt":
+    raise ImportError("levelproof runs on Linux and macOS: on Windows, use it in WSL.")
 if not os.path.isdir(os.path.join(__path__[0], "physics")):
     raise ImportError(
         f"{os.path.join(__path__[0], 'physics')} is not a folder, because git wrote this checkout without symbolic "

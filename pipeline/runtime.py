@@ -35,6 +35,7 @@ XLA_FLAGS = (
 XLA_THREADS = "NPROC", "PJRT_NPROC"  # size of XLA's pool
 NUMPY_THREADS = "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"
 NO_GPU = "JAX finds no usable GPU (check that levelproof's extra `gpu` is installed)"
+COMPRESSED = {b"\x28", b"\x78"}  # first bytes of what zstd and zlib write
 UNFINISHED = 3600.0  # s after which a file that a process began to write is a killed one's
 LAST_CHECK = "looked"  # file beside the programs, touched when a check begins; programs older than it were readable
 CLAIM_SECONDS = 2.0  # s for which a worker tries to claim a core
@@ -126,7 +127,9 @@ def remove_damaged(folder: Path) -> None:
     JAX writes a program in place and never replaces one, so a program that a killed process or a full disk left
     half-written would be recompiled, with a warning, at every start.
     """
-    from jax._src.compilation_cache import decompress_executable  # as JAX reads them, with the library that it chooses
+    from jax._src.compilation_cache import compress_executable, decompress_executable  # by the library that JAX chooses
+
+    foreign = COMPRESSED - {compress_executable(b"")[:1]}  # of environments that have the other library
 
     last, new = folder / LAST_CHECK, folder / f".{LAST_CHECK}.{os.getpid()}"
     with suppress(OSError):  # the folder is not writable: JAX itself warns of damaged programs
@@ -139,7 +142,9 @@ def remove_damaged(folder: Path) -> None:
         for path in folder.glob("*-cache"):
             try:
                 if path.stat().st_ctime_ns >= since:  # ns; ctime, because a copy may keep its original's mtime
-                    decompress_executable(path.read_bytes())
+                    data = path.read_bytes()
+                    if data[:1] not in foreign:
+                        decompress_executable(data)
             except OSError:  # it says nothing of the program
                 continue
             except Exception:  # each compression library raises its own type
@@ -196,9 +201,13 @@ def in_another_process(function: Callable[..., T], *arguments: Any) -> T:
     """Run a function in another process: it starts JAX, and Ray forks this one. A stop ends that process.
 
     Raises:
-        Failure: that process died.
+        Failure: that process died, or cannot be started.
     """
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+    try:
+        pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
+    except OSError as error:
+        raise Failure(f"This command cannot share a lock with another process ({error}): it needs /dev/shm.") from error
+    with pool as process:
         try:
             # A terminal sends Ctrl-C to the child, too, which would print a traceback: it inherits this mask
             before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})

@@ -111,5 +111,6 @@ def test_scripts_stop_the_command_at_the_end_of_an_allocation_and_requeue_it(
     assert not again or log(tmp_path)[-1] == f"scontrol {again}"
     if name == "slurm-ray":
         started = [line for line in log(tmp_path) if "ray start" in line]
+        assert all("--object-store-memory=" in line for line in started)
         assert any("--nodelist=a" in line and "--head --port=6379" in line for line in started)
         assert any("--nodelist=b" in line and "--address=a:6379" in line for line in started)

@@ -3,6 +3,7 @@
 #SBATCH --job-name=levelproof
 #SBATCH --nodes=4
 #SBATCH --ntasks-per-node=1
+#SBATCH --exclusive
 #SBATCH --cpus-per-task=32
 #SBATCH --mem-per-cpu=2G
 #SBATCH --time=04:00:00
@@ -15,9 +16,12 @@ mapfile -t hosts < <(scontrol show hostnames "$SLURM_JOB_NODELIST")
 head=${hosts[0]}
 export RAY_ADDRESS=$head:6379 OMP_NUM_THREADS=1
 
-start() { srun --nodes=1 --ntasks=1 --overlap --nodelist="$1" ray start --block --num-cpus="$SLURM_CPUS_PER_TASK" "${@:2}" & }
+start() { # levelproof keeps 80 MB in Ray's object store, which would otherwise take a third of the memory
+    srun --nodes=1 --ntasks=1 --overlap --nodelist="$1" \
+        ray start --block --num-cpus="$SLURM_CPUS_PER_TASK" --object-store-memory=100000000 "${@:2}" &
+}
 start "$head" --head --port=6379
-until ray status > /dev/null 2>&1; do sleep 1; done
+until ray status > /dev/null 2>&1; do kill -0 $! || exit 1; sleep 1; done
 for host in "${hosts[@]:1}"; do start "$host" --address="$RAY_ADDRESS"; done
 
 # B: above signals only this script, which stops the command; its workers live on to commit decided levels

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from threading import Lock
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Int
 
@@ -48,6 +49,8 @@ class Differing:
             return
         count = many(len(self.level_ids), "level")
         found = f"{STATES_DIFFER} {count} of {self._split} so far, such as level {ids[0]}"
+        if jax.default_backend() != "cpu":
+            found += f" (JAX computes on {jax.default_backend()} here; JAX_PLATFORMS=cpu gives the bits of CPUs)"
         if self._way == RAISE:
             raise Failure(f"{found}: {WAYS[RAISE]}.")
         try:

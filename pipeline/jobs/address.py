@@ -69,7 +69,9 @@ def cannot_start(error: Exception) -> LevelproofError | None:
             "with executor=inline."
         )
     if isinstance(error, OSError):
-        return Failure(f"Ray cannot start ({error}): fix that, or set RAY_TMPDIR to another folder.")
+        return Failure(
+            f"Ray cannot start ({error}): fix that, set RAY_TMPDIR to another folder, or use executor=inline."
+        )
     return None
 
 

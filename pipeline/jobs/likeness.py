@@ -18,6 +18,7 @@ Program = dict[str, str]  # versions by name
 COMPARED = ("levelproof", "jax", "jaxlib", "sampler")  # names in `provenance.versions`
 UNSEEN = 60  # s until a machine that does not see the split is left out
 FOLDERS = ("physics", "levelgen", "experts", "configs", "pipeline")
+ROOT = Path(__file__).parents[2]
 
 
 def program_of(job: JobConfig) -> Program:
@@ -33,7 +34,8 @@ def mismatch(program: Program, job: JobConfig) -> str:
         if here.get(name) != there:
             return (
                 f"The worker on {socket.gethostname()} has {name} {here.get(name, 'unknown')}, and this command {name} "
-                f"{there}: install the same levelproof and libraries there, restart its Ray, and run the same command."
+                f"{there}: install the same levelproof and libraries there (it imports {ROOT}), restart its Ray, and "
+                "run the same command."
             )
     return ""
 
@@ -69,7 +71,7 @@ def with_absolute_paths(job: JobConfig) -> JobConfig:
 @cache
 def _source() -> str:
     """Return a digest of this program's source files, because two checkouts may have the same version."""
-    digest, root = hashlib.sha256(), Path(__file__).parents[2]
-    for path in sorted(path for folder in FOLDERS for path in (root / folder).rglob("*.py")):
-        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    digest = hashlib.sha256()
+    for path in sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")):
+        digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:8]

@@ -85,6 +85,12 @@ def test_room_refuses_a_second_import_name(room: str) -> None:
     assert f"ImportError: import levelproof.{room}, not {room}" in done.stderr
 
 
+def test_import_on_windows_names_what_runs() -> None:
+    words = "import os, pathlib; os.name = 'nt'; import levelproof"
+    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, timeout=patience(60))
+    assert "ImportError: levelproof runs on Linux and macOS: on Windows, use it in WSL." in done.stderr
+
+
 def test_import_without_links_says_how_to_get_them(tmp_path: Path) -> None:
     package = tmp_path / "levelproof"
     package.mkdir()

@@ -2,9 +2,11 @@
 
 import os
 import time
+import zlib
 from pathlib import Path
 
 import pytest
+from jax._src.compilation_cache import compress_executable
 
 from levelproof.pipeline.runtime import LAST_CHECK, remove_damaged
 from tests.pipeline.test_runtime import python
@@ -38,6 +40,16 @@ def test_truncated_program_is_recompiled_without_a_warning(tmp_path: Path) -> No
     assert all(len(again[name]) > len(whole[name]) // 2 for name in whole)
     remove_damaged(folder)
     assert programs(folder) == again
+
+
+def test_remove_damaged_keeps_programs_that_another_library_compressed(tmp_path: Path) -> None:
+    """Environments with and without zstandard share the folder."""
+    is_zlib = compress_executable(b"")[:1] == b"\x78"
+    other = b"\x28\xb5\x2f\xfd" if is_zlib else zlib.compress(b"program")
+    for name, content in {"theirs": other, "ours": compress_executable(b"program")[:5]}.items():
+        (tmp_path / f"{name}-cache").write_bytes(content)
+    remove_damaged(tmp_path)
+    assert programs(tmp_path) == {"theirs-cache": other}
 
 
 def test_remove_damaged_deletes_what_killed_processes_were_writing(tmp_path: Path) -> None:

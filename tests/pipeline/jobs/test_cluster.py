@@ -463,6 +463,7 @@ def test_mismatch_names_what_differs() -> None:
         refusal = mismatch(program | {name: other}, job)
         assert f" has {name} {program[name]}, and this command {name} {other}: install" in refusal
         assert socket.gethostname() in refusal
+        assert f"(it imports {likeness.ROOT})" in refusal
 
 
 @pytest.fixture
