@@ -28,7 +28,7 @@ from levelproof.configs.compose import compose_job
 from levelproof.configs.numbers import parse_count
 from levelproof.experts.steps import Seconds
 from levelproof.pipeline.errors import Failure, UserError
-from levelproof.pipeline.store.columns import COLUMNS, RENAMED
+from levelproof.pipeline.store.columns import COLUMNS
 from levelproof.pipeline.store.layout import new_attempt, split_path, unit_name
 from levelproof.pipeline.store.manifest import begin_fragment, require_manifest, write_fragment
 from levelproof.pipeline.store.merge import FILE_BYTES
@@ -126,8 +126,7 @@ def made_split(folder: Path, levels: int) -> None:
     """Write a sealed split of `levels` levels."""
     job = compose_job([f"out={folder}", "size=s", "budget=128k", f"levels={levels}"])
     split = split_path(job.out, job.budget, job.size)
-    reference, rng = pq.read_table(REFERENCE), np.random.default_rng(0)
-    base = reference.rename_columns([RENAMED.get(name, name) for name in reference.column_names])
+    base, rng = pq.read_table(REFERENCE), np.random.default_rng(0)
     for first in range(0, levels, ROWS):
         ids = np.arange(first, min(first + ROWS, levels))
         attempt = new_attempt(split, unit_name(int(ids[0]), int(ids[-1])))

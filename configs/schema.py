@@ -54,17 +54,6 @@ WITHOUT_EFFECT = frozenset(
         "search.rounds",
     }
 )
-# Today's dotted names of settings by their names in earlier versions
-RENAMED: Mapping[str, str] = {
-    "expert.moved_attempts": "expert.perturbed_attempts",
-    "search.anew": "search.new_action",
-    "search.redrawn": "search.resample",
-    "search.steady": "search.robustness",
-    "search.stretch": "search.segments",
-    "stop.steady": "stop.robustness",
-}
-REMOVED: Mapping[str, Any] = {"scout.rounds": 0}  # settings of earlier versions: the value that matches this version
-ADDED: Mapping[str, Any] = {"search.patience_gap": 0.0}  # settings of this version: the value that matches earlier ones
 # Values of `distribution` in the hashed settings of jobs whose levels are not sampled
 FROM_FILES, FROM_RECORDS = "files", "import"
 # In the hashed settings of seed files and of splits grown from them: each record repeats its first episode
@@ -173,7 +162,8 @@ class JobConfig:
     @property
     def results(self) -> dict[str, Any]:
         """All settings that decide a level's results, as JSON's types."""
-        kept = decisive({f.name: plain(getattr(self, f.name)) for f in fields(self)})
+        settings = flat({f.name: plain(getattr(self, f.name)) for f in fields(self)})
+        kept = nested({name: value for name, value in settings.items() if name not in WITHOUT_EFFECT})
         if self.level_files:
             kept["distribution"] = FROM_FILES
         made = {"sampler_version": SAMPLER_VERSION, "engine_version": ENGINE_VERSION}
@@ -252,27 +242,6 @@ def rules_in(results: Mapping[str, Any]) -> TaskParams:
 def is_grown(results: Mapping[str, Any]) -> bool:
     """Whether these are the settings of a seed file, or of a split grown from one."""
     return REPEATED.items() <= results.items()
-
-
-def decisive(settings: Mapping[str, Any], renamed: Mapping[str, str] = RENAMED) -> dict[str, Any]:
-    """Return the settings that decide results, under today's names, whichever version wrote them.
-
-    Splits record the `JobConfig.results` of the version that made them. Readers compare splits by this function's
-    result, so that a setting may lose its effect, change its name, be removed or be added without making a split a
-    different one. A removed setting whose value this version cannot reproduce is kept, so that the configurations
-    differ.
-
-    Args:
-        settings: nested mappings, as in JSON.
-        renamed: today's dotted names by earlier ones.
-
-    Raises:
-        ValueError: a setting lies below a value.
-    """
-    now = {renamed.get(name, name): value for name, value in flat(settings).items() if REMOVED.get(name, ...) != value}
-    groups = {name.partition(".")[0] for name in now}  # a split that was imported has few
-    now = {name: value for name, value in ADDED.items() if name.partition(".")[0] in groups} | now
-    return nested({name: value for name, value in now.items() if name not in WITHOUT_EFFECT})
 
 
 def hash_of(results: dict[str, Any]) -> str:

@@ -11,8 +11,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from benchmarks.oracle import alone
-from levelproof.configs.convert import flat, nested
-from levelproof.configs.schema import RENAMED
 from levelproof.experts.config import Rule
 from levelproof.experts.labels import TRAINED, Label
 from levelproof.pipeline.errors import UserError
@@ -29,8 +27,7 @@ SCHEMA = pa.schema(
         ("level_id", pa.int64()),
         ("label", WORD),
         ("env_steps", pa.int64()),  # of training
-        ("evaluation_steps", pa.int64()),  # env steps, as the next two; null: not counted
-        ("scout_steps", pa.int64()),
+        ("evaluation_steps", pa.int64()),  # env steps, as the next one; null: not counted
         ("search_steps", pa.int64()),
         ("witness", WORD),  # source of the witness; null: no witness, or not recorded
         # of sampled first episodes after training (older rows: in the last evaluation); null: none ended
@@ -45,7 +42,7 @@ SCHEMA = pa.schema(
     ]
 )
 OF_LEVEL = (
-    "label", "env_steps", "evaluation_steps", "scout_steps", "search_steps", "witness", "success_rate",
+    "label", "env_steps", "evaluation_steps", "search_steps", "witness", "success_rate",
     "most_probable_succeeds", "steps_to_goal", "core_seconds",
 )  # fmt: skip
 OF_RUN = ("versions", "device", "date")
@@ -105,9 +102,7 @@ def read(file: Path = FILE) -> list[Results]:
     for line in lines:
         key = line["size"], line["budget"], line["variant"]
         if key not in groups:
-            settings = flat(json.loads(line["settings"]))
-            now = nested({RENAMED.get(name, name): value for name, value in settings.items()})
-            groups[key] = Results(Header(key[2], key[0], key[1], now), {})
+            groups[key] = Results(Header(key[2], key[0], key[1], json.loads(line["settings"])), {})
         groups[key].rows[line["level_id"]] = {name: line[name] for name in (*OF_LEVEL, *OF_RUN)}
     return list(groups.values())
 

@@ -87,8 +87,8 @@ def known_share(facts: Sequence[bool | None]) -> str:
 
 
 def steps_of(row: Mapping[str, Any]) -> int:
-    """Return a level's env steps: of training, evaluations, scouting and search."""
-    return sum(row[name] or 0 for name in ("env_steps", "evaluation_steps", "scout_steps", "search_steps"))
+    """Return a level's env steps: of training, evaluations and search."""
+    return sum(row[name] or 0 for name in ("env_steps", "evaluation_steps", "search_steps"))
 
 
 def paired(group: Sequence[Results]) -> list[list[str]]:

@@ -1,6 +1,6 @@
 """The manifest's columns, their meanings and versions; docs/columns.md is generated from here.
 
-Readers refuse a fragment of an unknown version instead of guessing.
+Readers refuse a fragment of another version instead of guessing.
 """
 
 from collections.abc import Sequence
@@ -10,9 +10,7 @@ import pyarrow as pa
 
 from levelproof.experts.steps import Seconds
 
-MANIFEST_VERSION, OLDEST_VERSION = 9, 6  # written; still read
-RENAMING_VERSION = 9  # first with today's names
-RENAMED = {"moved_success_rate": "perturbed_success_rate"}  # today's names by those of earlier versions
+MANIFEST_VERSION = 9
 
 # Columns that depend on the run and not on the level: in all others two runs of a job agree, bit for bit
 OF_THE_RUN = ("shard", "row", "experts", "seconds")
@@ -33,7 +31,6 @@ class ManifestColumn(NamedTuple):
     meaning: str
     unit: str = ""
     null: str = ""  # meaning of null; empty: the column has no nulls
-    since: int = OLDEST_VERSION  # first manifest version with it
 
     @property
     def text(self) -> str:
@@ -183,7 +180,6 @@ DESCRIBED = (
         pa.int32(),
         "Version of the arithmetic of a physics step",
         null="earlier versions: 1",
-        since=8,
     ),
     ManifestColumn("device", pa.string(), "Device that computed the row, such as `cpu: AMD EPYC`"),
     ManifestColumn("command", pa.string(), "Command that regenerates this row"),
@@ -195,22 +191,9 @@ DESCRIBED = (
         "work on the core makes it longer",
         "s",
         "not measured",
-        since=7,
     ),
 )
 COLUMNS = pa.schema([pa.field(column.name, column.type, nullable=bool(column.null)) for column in DESCRIBED])
-
-
-def stored_names(names: Sequence[str], renamed: bool) -> dict[str, str]:
-    """Map columns to their names in a file, which are today's if it was written after they were `renamed`."""
-    old = {} if renamed else {new: old for old, new in RENAMED.items()}
-    return {name: old.get(name, name) for name in names}
-
-
-VERSIONS = {  # names of the columns of each version by today's names
-    str(version): stored_names([c.name for c in DESCRIBED if c.since <= version], version >= RENAMING_VERSION)
-    for version in range(OLDEST_VERSION, MANIFEST_VERSION + 1)
-}
 
 
 def schema_of(
@@ -219,17 +202,9 @@ def schema_of(
     columns: pa.Schema = COLUMNS,
     repetitive: Sequence[str] = REPETITIVE,
 ) -> pa.Schema:
-    """Return the schema of columns, by any version's names; `compact`: with repetitive ones as dictionaries."""
-    fields = [columns.field(RENAMED.get(name, name)).with_name(name) for name in names]
+    """Return the schema of columns; `compact`: with repetitive ones as dictionaries."""
+    fields = [columns.field(name) for name in names]
     if compact:
         as_dictionary = pa.dictionary(pa.int32(), pa.string())
         fields = [field.with_type(as_dictionary) if field.name in repetitive else field for field in fields]
     return pa.schema(fields)
-
-
-def completed(table: pa.Table, requested: Sequence[str]) -> pa.Table:
-    """Append the requested columns that an older version lacks, as nulls."""
-    for column in DESCRIBED:
-        if column.name in requested and column.name not in table.column_names:
-            table = table.append_column(COLUMNS.field(column.name), pa.nulls(table.num_rows, column.type))
-    return table

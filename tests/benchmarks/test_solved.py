@@ -41,7 +41,7 @@ def header(name: str = "alone", size: str = "s", budget: int = 64_000) -> Header
 def row(level_id: int, label: str, env_steps: int, steps: int | None = None) -> tuple[int, dict[str, Any]]:
     rate = 0.5 if label == "solved" else None
     values = {"label": label, "env_steps": env_steps, "success_rate": rate, "steps_to_goal": steps, "core_seconds": 1.5}
-    values |= {"witness": "sampled" if rate else None, "evaluation_steps": 10, "scout_steps": 20, "search_steps": 30}
+    values |= {"witness": "sampled" if rate else None, "evaluation_steps": 10, "search_steps": 50}
     values |= {"most_probable_succeeds": False}
     return level_id, values | {"versions": '{"python": "3"}', "device": "cpu: none", "date": "2026-01-01"}
 
