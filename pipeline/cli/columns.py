@@ -25,7 +25,6 @@ it.
 |---|---|---|
 """
 END = """
-Manifests of version {oldest}, which had no {newer}, can be read, too: these columns are null there. {renamed} \
 `seconds` and `versions` are structs: in SQL, write `seconds.training` and `versions.jax`.
 
 More on [labels](labels.md) and their evidence, [content hashes and signatures](levels.md), \
@@ -68,17 +67,7 @@ def _type_and_unit(column: "ManifestColumn") -> str:
 
 def as_markdown() -> str:
     """Return the page docs/columns.md."""
-    from levelproof.pipeline.store.columns import (
-        DESCRIBED,
-        MANIFEST_VERSION,
-        OLDEST_VERSION,
-        RENAMED,
-        RENAMING_VERSION,
-    )
+    from levelproof.pipeline.store.columns import DESCRIBED, MANIFEST_VERSION
 
-    newer = " and ".join(f"`{column.name}`" for column in DESCRIBED if column.since > OLDEST_VERSION)
     rows = [f"| `{column.name}` | {_type_and_unit(column)} | {column.text} |" for column in DESCRIBED]
-    renamed = " ".join(f"Before version {RENAMING_VERSION}, `{new}` was `{old}`." for old, new in RENAMED.items())
-    start = INTRODUCTION.format(version=MANIFEST_VERSION)
-    end = END.format(oldest=OLDEST_VERSION, newer=newer, renamed=renamed)
-    return start + "\n".join(rows) + "\n" + end
+    return INTRODUCTION.format(version=MANIFEST_VERSION) + "\n".join(rows) + "\n" + END

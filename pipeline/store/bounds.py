@@ -7,7 +7,7 @@ small; strings without a dictionary are as long as their pages.
 """
 
 import errno
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
@@ -69,7 +69,7 @@ class FileKind:
     """A kind of parquet file, and how large its valid files can be."""
 
     name: str
-    columns: pa.Schema  # of all versions
+    columns: pa.Schema
     repetitive: tuple[str, ...]  # string columns that may be returned as dictionaries
     own: tuple[str, ...]  # columns of bytes or strings without dictionaries; their positions are fixed
     encoding: int  # of the pages of `own`
@@ -114,18 +114,15 @@ class Bounded:
             raise ValueError("the rows of its groups do not add up")
         if not made_by.startswith(WRITER):
             raise ValueError("it was written by another library")
-        # The positions of these columns are the same in every version
-        names = tuple(kind.columns.names)
-        own = [i for i, leaf in enumerate(_expected(kind, names).leaves) if _column_of(leaf) in kind.own]
+        own = [i for i, leaf in enumerate(_expected(kind).leaves) if _column_of(leaf) in kind.own]
         self._are_plain = not any(group.columns[i].has_dictionary for group in self._groups for i in own)
-        self._file = _open(source, _expected(kind, names, self._are_plain).texts)
+        self._file = _open(source, _expected(kind, self._are_plain).texts)
         stored: dict[bytes, bytes] = self._file.metadata.metadata or {}  # also what was added after the schema
         self.metadata = {key: value for key, value in stored.items() if key != ARROW_SCHEMA}
 
     def read(
         self,
         names: Sequence[str],
-        stored_as: Mapping[str, str],
         level_ids: np.ndarray | None = None,
         compact: bool = False,
         at: np.ndarray | None = None,
@@ -134,7 +131,6 @@ class Bounded:
 
         Args:
             names: columns to read.
-            stored_as: names in the file of all columns that it must have.
             level_ids: levels whose row groups to read.
             compact: return repetitive columns as dictionaries.
             at: positions whose row groups to read, if they are known.
@@ -142,7 +138,7 @@ class Bounded:
         Raises:
             One of DAMAGE: the file is damaged, or would take too much memory.
         """
-        known = _expected(self._kind, tuple(stored_as.values()), self._are_plain)
+        known = _expected(self._kind, self._are_plain)
         if not self._file.schema.equals(known.schema) or not self._file.schema_arrow.equals(known.as_read):
             raise ValueError(f"its columns are not those of a {self._kind.name}")
         groups = range(len(self._groups))
@@ -151,9 +147,9 @@ class Bounded:
         if at is not None:
             ends = np.cumsum([group.rows for group in self._groups])
             groups = np.unique(np.searchsorted(ends, at, "right")).tolist()
-        table = self._read(known, groups, [stored_as[name] for name in names])
-        wanted = _schema_of(self._kind, names, compact)
-        stored = {name: table.column(stored_as[name]) for name in names}
+        table = self._read(known, groups, names)
+        wanted = schema_of(names, compact, self._kind.columns, self._kind.repetitive)
+        stored = {name: table.column(name) for name in names}
         expanded = [name for name, column in stored.items() if column.type != wanted.field(name).type]
         if any(map(_has_controls, (chunk for name in names if name != UNSEEN for chunk in stored[name].chunks))):
             raise ValueError("its strings contain control characters")
@@ -235,7 +231,7 @@ def _inside(column: pa.Array) -> list[pa.Array]:
 
 
 class _Expected(NamedTuple):
-    """Schema of a valid file with given columns."""
+    """Schema of a valid file of a kind."""
 
     schema: pq.ParquetSchema
     as_read: pa.Schema  # with strings as dictionaries
@@ -245,19 +241,15 @@ class _Expected(NamedTuple):
 
 
 @cache
-def _expected(kind: FileKind, names: tuple[str, ...], own_are_plain: bool = False) -> _Expected:
-    """Return the schema of a file with these columns; with `own_are_plain`, `kind.own` have no dictionaries."""
+def _expected(kind: FileKind, own_are_plain: bool = False) -> _Expected:
+    """Return the schema of a file of this kind; with `own_are_plain`, `kind.own` have no dictionaries."""
     sink = pa.BufferOutputStream()
-    pq.write_table(_schema_of(kind, names).empty_table(), sink)
+    pq.write_table(kind.columns.empty_table(), sink)
     schema = pq.ParquetFile(pa.BufferReader(sink.getvalue())).schema
     leaves = [schema.column(i) for i in range(len(schema))]
     plain = [leaf.path for leaf in leaves if own_are_plain and _column_of(leaf) in kind.own]
     texts = [leaf.path for leaf in leaves if leaf.physical_type == "BYTE_ARRAY" and leaf.path not in plain]
     return _Expected(schema, _open(pa.BufferReader(sink.getvalue()), texts).schema_arrow, leaves, texts, plain)
-
-
-def _schema_of(kind: FileKind, names: Sequence[str], compact: bool = False) -> pa.Schema:
-    return schema_of(names, compact, kind.columns, kind.repetitive)
 
 
 def _column_of(leaf: pq.ColumnSchema) -> str:
@@ -266,7 +258,7 @@ def _column_of(leaf: pq.ColumnSchema) -> str:
 
 def with_dictionaries(kind: FileKind = FRAGMENTS) -> list[str]:
     """Return the paths of a file's leaves that are written with dictionaries."""
-    leaves = _expected(kind, tuple(kind.columns.names)).leaves
+    leaves = _expected(kind).leaves
     return [leaf.path for leaf in leaves if _column_of(leaf) not in kind.own]
 
 

@@ -9,15 +9,14 @@ from typing import Any, get_args
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
-from levelproof.configs.schema import KEYS_EVERY, Density, decisive, hash_of, stored_as
+from levelproof.configs.schema import KEYS_EVERY, Density, hash_of, stored_as
 from levelproof.experts.labels import Label, Source
 from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
 from levelproof.levelgen.level import size_of
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.bounds import DAMAGE, DataUnread, bounded, unread
-from levelproof.pipeline.store.columns import COLUMNS, MANIFEST_VERSION, OLDEST_VERSION, VERSIONS, completed
+from levelproof.pipeline.store.columns import COLUMNS, MANIFEST_VERSION
 from levelproof.pipeline.store.formats import CONFIG_KEY, DENSITIES_KEY, DIGESTS_KEY, HASH_KEY, SEALED_KEY, VERSION_KEY
 from levelproof.pipeline.store.layout import ids_of
 from levelproof.pipeline.store.remote import FileChanged, mended
@@ -35,7 +34,7 @@ class Fragment:
 
     path: Path
     config_hash: str  # hash of `config`
-    config: dict[str, Any]  # the settings that decide results, with current names
+    config: dict[str, Any]  # the settings that decide results
     digests: dict[str, dict[str, str]]  # of the files of each shard and checkpoint that its rows name
     rows: int
     sealed: bool
@@ -60,20 +59,16 @@ def read_fragment(
             version = metadata.get(VERSION_KEY, b"?").decode()
             if not version.isdecimal():
                 raise ValueError("it has no version")
-            if version not in VERSIONS:
+            if version != str(MANIFEST_VERSION):
                 raise DataUnread(
-                    f"The fragment {path} has manifest version {version[:9]}, but this program reads versions "
-                    f"{OLDEST_VERSION} to {MANIFEST_VERSION}: use the levelproof that wrote it."
+                    f"The fragment {path} has manifest version {version[:9]}, but this program reads version "
+                    f"{MANIFEST_VERSION}: use the levelproof that wrote it."
                 )
-            written = metadata[HASH_KEY].decode()
-            config, config_hash = settings_in(metadata[CONFIG_KEY], written)
+            config_hash = metadata[HASH_KEY].decode()
+            config = settings_in(metadata[CONFIG_KEY], config_hash)
             digests, densities = _digests_in(metadata), _densities_in(metadata)
             fragment = Fragment(path, config_hash, config, digests, file.rows, SEALED_KEY in metadata, densities)
-            wanted = COLUMNS.names if columns is None else columns
-            stored = file.read(
-                [name for name in wanted if name in VERSIONS[version]], VERSIONS[version], level_ids, compact
-            )
-            table = _with_hash(completed(stored, wanted), written, config_hash)
+            table = file.read(COLUMNS.names if columns is None else columns, level_ids, compact)
             if "level_id" in table.column_names:
                 _require_own_levels(table.column("level_id").to_numpy(), path)
             _require_known(table)
@@ -108,24 +103,22 @@ def _require_known(table: pa.Table) -> None:
 
 
 def _densities_in(metadata: Mapping[bytes, bytes]) -> frozenset[str]:
-    densities = frozenset(json.loads(metadata.get(DENSITIES_KEY, json.dumps(FULL))))
+    densities = frozenset(json.loads(metadata[DENSITIES_KEY]))
     if not densities <= DENSITIES:
         raise ValueError("it names an unknown density")
     return densities
 
 
 def _digests_in(metadata: Mapping[bytes, bytes]) -> dict[str, dict[str, str]]:
-    digests = json.loads(metadata.get(DIGESTS_KEY, b"{}"))
+    digests = json.loads(metadata[DIGESTS_KEY])
     if not isinstance(digests, dict) or not all(isinstance(files, dict) for files in digests.values()):
         raise ValueError("its digests are invalid")
     return digests
 
 
 @lru_cache(maxsize=8)
-def settings_in(text: bytes, written: str) -> tuple[dict[str, Any], str]:
-    """Parse a fragment's settings; return them with current names, and their hash. Most fragments repeat the last one.
-
-    `written` is the hash beside them, from the version that wrote both.
+def settings_in(text: bytes, config_hash: str) -> dict[str, Any]:
+    """Parse a fragment's settings. Most fragments repeat the last one.
 
     Raises:
         ValueError: they are invalid, or do not match the hash.
@@ -133,17 +126,6 @@ def settings_in(text: bytes, written: str) -> tuple[dict[str, Any], str]:
     config = json.loads(text)
     if not isinstance(config, dict) or text.count(b"[") + text.count(b"{") > MAX_BRACKETS:
         raise ValueError("its settings are invalid")
-    if hash_of(config) != written:
+    if hash_of(config) != config_hash:
         raise ValueError("its settings do not match their hash")
-    config = decisive(config)
-    return config, hash_of(config)
-
-
-def _with_hash(table: pa.Table, written: str, config_hash: str) -> pa.Table:
-    """Replace the hash of the version that wrote the rows by the current one."""
-    if written == config_hash or "config_hash" not in table.column_names:
-        return table
-    at = table.schema.get_field_index("config_hash")
-    column = table.column(at).cast(pa.string())
-    renewed = pc.if_else(pc.equal(column, written), config_hash, column)  # pyright: ignore[reportAttributeAccessIssue]
-    return table.set_column(at, table.schema.field(at), renewed.cast(table.schema.field(at).type))
+    return config

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from levelproof.configs.schema import JobConfig, decisive, hash_of
+from levelproof.configs.schema import JobConfig, hash_of
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.store.bounds import unread
 from levelproof.pipeline.store.files import write
@@ -33,7 +33,7 @@ class JobNote:
 
     command: str  # the last one
     level_ids: np.ndarray  # (run, 2): first and last of each run of ids, ascending
-    config: dict[str, Any] | None  # the settings that decide results, with current names
+    config: dict[str, Any] | None  # the settings that decide results
     intact: bool  # every byte is as written
 
 
@@ -89,8 +89,8 @@ def read_note(split: Path) -> JobNote:
         command, config = note["command"], note.get("config")
         if not isinstance(command, str) or (runs[:, 0] > runs[:, 1]).any():
             raise ValueError
-        known = isinstance(config, dict) and hash_of(config) == note["config_hash"]
-        config = decisive(config) if known else None
+        if not isinstance(config, dict) or hash_of(config) != note["config_hash"]:
+            config = None
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise NoteError(type(error).__name__) from None
     content = {name: value for name, value in note.items() if name != DIGEST}

@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from os import DirEntry
 from pathlib import Path
 
-from levelproof.configs.schema import REMOVED, JobConfig
+from levelproof.configs.schema import JobConfig
 from levelproof.pipeline.errors import LevelproofError, StoreFailure, UserError
 from levelproof.pipeline.store.disk import explaining_writes, flush_entry, write_new
 from levelproof.pipeline.store.layout import EVENTS, FOLDERS, INDEX_FILE, JOB, MANIFEST, entries, split_path
@@ -40,10 +40,9 @@ def writing(job: JobConfig, say: Callable[[str], None], split: Path | None = Non
     with taken(split, say) as manifest:
         if manifest.config_hash not in (None, job.hash):
             changes = differences(manifest.config or {}, job.results)
-            same = "the version of levelproof that made it" if changes.keys() & REMOVED else "the same settings"
             raise UserError(
                 f"The split {split} was made with another configuration ({changes_text(changes)}): "
-                f"use {same}, or another folder with out=NAME or -o."
+                "use the same settings, or another folder with out=NAME or -o."
             )
         stored = {density for fragment in manifest.fragments for density in fragment.densities}
         if stored and job.stored not in stored:

@@ -13,7 +13,6 @@ from omegaconf import OmegaConf
 from levelproof.configs.compose import (
     FOLDERS,
     _default,
-    changed_settings,
     compose_job,
     default_presets,
     distributions,
@@ -21,10 +20,10 @@ from levelproof.configs.compose import (
     presets,
     shortest_command,
 )
-from levelproof.configs.convert import flat, nested, plain
+from levelproof.configs.convert import flat, plain
 from levelproof.configs.errors import ConfigError
 from levelproof.configs.meanings import every_setting
-from levelproof.configs.schema import ADDED, RENAMED, WITHOUT_EFFECT, GrowConfig, ImportConfig, decisive, hash_of
+from levelproof.configs.schema import WITHOUT_EFFECT, GrowConfig, ImportConfig
 from levelproof.experts.config import ExpertConfig
 from levelproof.levelgen.sampling.distribution import Distribution
 from levelproof.levelgen.task.rules import TaskParams
@@ -150,40 +149,6 @@ def test_job_hash_ignores_settings_of_the_machine() -> None:
     """Tests of experts/pool and experts/search show that these two change no result."""
     machine = {setting.name for setting in every_setting() if setting.group.endswith(": machine")}
     assert machine == {name for name in WITHOUT_EFFECT if "." in name} == {"expert.slots", "search.rounds"}
-
-
-def test_decisive_takes_stored_settings_for_those_of_today() -> None:
-    results = compose_job(["search.new_action=0.4"]).results
-    before = decisive(results, {new: old for old, new in RENAMED.items()})
-    assert set(RENAMED) <= set(flat(before))
-    assert hash_of(before) != hash_of(results)
-    assert decisive(before) == results
-
-
-def test_decisive_renames_settings_of_earlier_versions() -> None:
-    old = {"size": "s", "budget": 128_000, "expert": {"slots": 4, "units": 64}, "scout": {"tries": 3}}
-    renamed = {"expert.units": "expert.width", "scout.tries": "search.tries", "rooms": "expert.slots"}
-    now = decisive(old | {"rooms": 2}, renamed)
-    assert now == {"size": "s", "budget": 128_000, "expert": {"width": 64}, "search": {"tries": 3, "patience_gap": 0}}
-    assert decisive(now) == now
-    with pytest.raises(ValueError, match="below a value"):
-        decisive({"a": 1, "a.b": 2})
-
-
-def test_decisive_adds_settings_that_earlier_versions_lacked() -> None:
-    """With the value that gives the earlier results, not with today's default."""
-    results = compose_job(["search.patience_gap=0"]).results
-    without = {name: value for name, value in flat(results).items() if name not in ADDED}
-    assert decisive(nested(without)) == results
-    assert decisive(compose_job([]).results) == compose_job([]).results
-    assert compose_job(changed_settings(decisive(nested(without)))).results == results
-    assert decisive({"size": "s", "sampler_version": 1}) == {"size": "s", "sampler_version": 1}
-
-
-def test_decisive_drops_removed_settings_that_match_this_version() -> None:
-    results = compose_job([]).results
-    assert decisive(results | {"scout": {"rounds": 0}}) == results
-    assert decisive(results | {"scout": {"rounds": 4}}) == results | {"scout": {"rounds": 4}}
 
 
 @pytest.mark.parametrize(

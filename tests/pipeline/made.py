@@ -31,7 +31,7 @@ from levelproof.physics.types import MAX_VERTICES, Size
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import commit
 from levelproof.pipeline.store.checksums import with_own
-from levelproof.pipeline.store.columns import OF_THE_RUN, stored_names
+from levelproof.pipeline.store.columns import OF_THE_RUN
 from levelproof.pipeline.store.contents import highest
 from levelproof.pipeline.store.fields import arrays_of, same_bits, tree_of
 from levelproof.pipeline.store.job_note import note_job
@@ -245,12 +245,6 @@ def rewrite(path: Path, table: pa.Table, metadata: Mapping[Any, Any] | None = No
     whole, about = pa.BufferOutputStream(), {**(table.schema.metadata or {}), **(metadata or {})}
     pq.write_table(table.replace_schema_metadata(about), whole, **how)
     path.write_bytes(with_own(whole.getvalue().to_pybytes()))
-
-
-def renamed_before(table: pa.Table) -> pa.Table:
-    """Return a table whose columns have the names of earlier versions."""
-    renamed = table.rename_columns([*stored_names(table.column_names, renamed=False).values()])
-    return renamed.replace_schema_metadata(table.schema.metadata)
 
 
 def commit_copy(source: Path, number: int, split: Path) -> None:

@@ -8,7 +8,6 @@ from typing import Any
 import pyarrow as pa
 
 from levelproof.pipeline.store.bounds import FileKind
-from levelproof.pipeline.store.columns import stored_names
 
 SEED_VERSION = "2"
 SEED_KEY = b"levelproof.seed_version"
@@ -34,8 +33,6 @@ FIELDS = (
     pa.field("made_with", pa.string(), nullable=False),  # the manifest's `versions`, `engine` and `device`, as JSON
 )
 SCHEMA = pa.schema(FIELDS)
-# Names of the columns of each version by today's names
-VERSIONS = {"1": stored_names(SCHEMA.names, renamed=False), SEED_VERSION: stored_names(SCHEMA.names, renamed=True)}
 # Same name and meaning as in the manifest
 KEPT = (
     "label", "steps_to_goal", "success_rate", "most_probable_succeeds", "sticky_success_rate", "perturbed_success_rate",

@@ -26,8 +26,8 @@ from levelproof.pipeline.store.seed.columns import (
     CONTENT_KEY,
     ROW_GROUP,
     SEED_KEY,
+    SEED_VERSION,
     SEEDS,
-    VERSIONS,
 )
 from levelproof.pipeline.store.seed.packed import MAX_BYTES
 
@@ -73,7 +73,7 @@ def name_of_table(what: str, files: Sequence[Path]) -> str | None:
 
 def describe_seed(path: Path) -> SeedFile:
     """Read what a seed file says of itself. Raises as `read_seed`."""
-    with _opened(path) as (about, _, _):
+    with _opened(path) as (about, _):
         return about
 
 
@@ -95,8 +95,8 @@ def read_seed(
         UserError: it is not a seed file.
         Failure: it is missing, damaged, or has another version.
     """
-    with _opened(path) as (about, file, stored_as):
-        table = file.read(list(dict.fromkeys(["level_id", *names])), stored_as, compact=compact, at=at)
+    with _opened(path) as (about, file):
+        table = file.read(list(dict.fromkeys(["level_id", *names])), compact=compact, at=at)
         _check(table)
         return about, table
 
@@ -124,18 +124,19 @@ def _known_ids(path: Path, _: tuple[int, ...]) -> tuple[SeedFile, np.ndarray]:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[SeedFile, Bounded, dict[str, str]]]:
-    """Open a seed file; also yield the stored names of its columns. The block's errors are raised as `read_seed`'s."""
+def _opened(path: Path) -> Iterator[tuple[SeedFile, Bounded]]:
+    """Open a seed file. The block's errors are raised as `read_seed`'s."""
     try:
         with bounded(path, SEEDS) as file:
             metadata = file.metadata
             version = metadata.get(SEED_KEY, b"?").decode()
-            if version not in VERSIONS:
+            if version != SEED_VERSION:
                 raise Failure(
                     f"The file {path} is not a seed file that this program reads (its version is {version[:9]!r}, not "
-                    f"{' or '.join(VERSIONS)}): `levelproof export SPLIT --format seed` writes one."
+                    f"{SEED_VERSION}): `levelproof export SPLIT --format seed` writes one."
                 )
-            config, config_hash = settings_in(metadata[CONFIG_KEY], metadata[HASH_KEY].decode())
+            config_hash = metadata[HASH_KEY].decode()
+            config = settings_in(metadata[CONFIG_KEY], config_hash)
             budget, content = metadata[BUDGET_KEY].decode(), json.loads(metadata[CONTENT_KEY])
             if (
                 not re.fullmatch(BUDGET, budget)
@@ -144,7 +145,7 @@ def _opened(path: Path) -> Iterator[tuple[SeedFile, Bounded, dict[str, str]]]:
             ):
                 raise ValueError("its metadata are not those of a seed file")
             fragment = Fragment(path, config_hash, config, {}, file.rows, True, frozenset({STORED}))
-            yield SeedFile(fragment, budget, tuple(content)), file, VERSIONS[version]
+            yield SeedFile(fragment, budget, tuple(content)), file
     except FileNotFoundError:
         raise missing_seed(path) from None
     except PermissionError:

@@ -1,14 +1,11 @@
 """Notes of the last command: read as written, with any changed byte detected."""
 
-import json
 import os
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
-from levelproof.configs.convert import plain
-from levelproof.configs.schema import hash_of
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.store import files, job_note
 from levelproof.pipeline.store.job_note import NoteError, note_density, note_job, read_note
@@ -106,13 +103,3 @@ def test_read_note_refuses_pipes_and_large_files(split: Path) -> None:
 def test_read_note_replaces_control_characters(split: Path) -> None:
     note_job(split, made_job(), ["\x1b[2J"], [])
     assert read_note(split).command == "'?[2J'"
-
-
-def test_read_note_updates_settings_of_earlier_versions(tmp_path: Path) -> None:
-    job = made_job()
-    before = job.results | {"expert": plain(job.expert) | {"slots": 8}}
-    note = {"command": "levelproof generate", "level_ids": [[0, 7]], "config_hash": hash_of(before), "config": before}
-    (tmp_path / JOB).write_text(json.dumps(note))
-    assert read_note(tmp_path).config == job.results
-    (tmp_path / JOB).write_text(json.dumps(note | {"config_hash": job.hash}))
-    assert read_note(tmp_path).config is None

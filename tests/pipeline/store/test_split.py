@@ -1,26 +1,17 @@
 """A split opened for writing: one writer, one configuration, folders of its own."""
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from levelproof.configs.convert import plain
-from levelproof.configs.schema import JobConfig, hash_of
+from levelproof.configs.schema import JobConfig
 from levelproof.experts.labels import Label
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.unit import commit
 from levelproof.pipeline.store import split as split_module
-from levelproof.pipeline.store.layout import FOLDERS, new_attempt
+from levelproof.pipeline.store.layout import FOLDERS
 from levelproof.pipeline.store.locks import is_written
-from levelproof.pipeline.store.manifest import (
-    begin_fragment,
-    fragment_paths,
-    read_fragment,
-    read_manifest,
-    write_fragment,
-)
 from levelproof.pipeline.store.split import writing
 from tests.pipeline.made import made_job, made_result
 
@@ -80,42 +71,6 @@ def test_writing_accepts_more_levels(tmp_path: Path, job: JobConfig) -> None:
         committed(job, split)
     with writing(made_job(str(tmp_path / "data"), "levels=128", "unit=7", "workers=1"), print) as (_, manifest):
         assert len(manifest.level_ids) == 2
-
-
-def written_with(job: JobConfig, config: dict[str, Any]) -> Path:
-    """Write a split whose fragment stores `config`, as an earlier version did."""
-    with writing(job, print) as (split, _):
-        committed(job, split)
-    (path,) = fragment_paths(split)
-    rows = [row | {"config_hash": hash_of(config)} for row in read_fragment(path)[1].to_pylist()]
-    attempt = new_attempt(split, path.stem)
-    begin_fragment(attempt)
-    write_fragment(attempt, rows, hash_of(config), config)
-    return split
-
-
-def test_writing_resumes_a_split_with_the_hash_of_an_earlier_version(tmp_path: Path, job: JobConfig) -> None:
-    """Hashes covered the number of experts side by side, the host syncs of a search, and scouts."""
-    before = job.results | {"expert": plain(job.expert) | {"slots": 8}, "search": plain(job.search)}
-    before["scout"] = {"rounds": 0}
-    assert hash_of(before) != job.hash
-    split = written_with(job, before)
-    other = made_job(job.out, "expert.width=64")
-    assert_refused(other, r"\(expert.width was 32, now 64\)")
-    with writing(made_job(job.out, "expert.slots=3"), print) as (_, manifest):
-        assert manifest.config == job.results
-        commit(job, split, WorkUnit((2, 3)), made_result([2, 3], [Label.UNSOLVED, Label.UNSOLVED]))
-    for compact in (False, True):
-        manifest = read_manifest(split, compact=compact)
-        assert manifest.level_ids.tolist() == [0, 1, 2, 3]
-        assert set(manifest.table.column("config_hash").to_pylist()) == {job.hash} == {manifest.config_hash}
-
-
-def test_writing_refuses_a_split_made_with_removed_settings(tmp_path: Path, job: JobConfig) -> None:
-    split = written_with(job, job.results | {"scout": {"rounds": 4}})
-    message = r"\(scout.rounds was 4, now absent\): use the version of levelproof that made it, or another folder"
-    assert_refused(job, message)
-    assert read_manifest(split).level_ids.tolist() == [0, 1]
 
 
 @pytest.mark.parametrize("place", ["data", "data/128k", "data/128k/s"])
