@@ -221,6 +221,17 @@ def from_files(results: Mapping[str, Any]) -> bool:
     return results.get("distribution") in (FROM_FILES, FROM_RECORDS)
 
 
+def other_sampler(results: Mapping[str, Any]) -> str:
+    """Say which sampler made the levels of a job with these `JobConfig.results`, as a verb phrase; empty: this one.
+
+    Levels of files have the same bits in every version.
+    """
+    version = results.get("sampler_version")
+    if version == SAMPLER_VERSION or from_files(results):
+        return ""
+    return f"has levels from sampler version {version!r:.9}, but this levelproof has version {SAMPLER_VERSION}"
+
+
 def distribution_in(results: Mapping[str, Any]) -> Distribution | None:
     """Return the distribution that a job with these `JobConfig.results` samples; None: its levels come from files.
 

@@ -17,9 +17,6 @@ from jaxtyping import Array, Int, Key
 from numpy.typing import ArrayLike
 
 SAMPLER_VERSION = 2  # of the sampler's arithmetic: increment if a change alters any bit of the level of any id
-# Versions whose levels differ only in the last digits of numbers; version 1 was computed by XLA, whose bits depended
-# on the processor
-ALIKE_VERSIONS = (1, 2)
 STREAMS = 1  # folded into the root key for all keys of levels
 SEEDS = 0x5EED  # folded into the root key for all keys of seeds
 ROOT_KEY = (0, 0)  # the key's words; to a seed, JAX would add `jax_random_seed_offset`

@@ -21,7 +21,6 @@ from levelproof.pipeline.read.level_files import level_file_paths
 from levelproof.pipeline.read.levels import writing_to
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store import files
-from levelproof.pipeline.store.formats import FIRST_VERSION
 from levelproof.pipeline.store.origins import can_be_noted
 from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.seed.columns import ROW_GROUP, SCHEMA
@@ -124,7 +123,7 @@ def _played(about: SeedFile, rows: pa.Table, found: Mapping[int, list[FoundLevel
     """
     files = [found[level_id] for level_id in rows.column("level_id").to_pylist()]
     chosen = [each[0] for each in files]
-    same_engine = about.fragment.config.get("engine_version", FIRST_VERSION) == ENGINE_VERSION
+    same_engine = about.fragment.config.get("engine_version") == ENGINE_VERSION
     left = np.flatnonzero(rows.column("witness").is_valid().to_numpy()) if same_engine else np.zeros(0, int)
     for attempt in count():
         for i in left:

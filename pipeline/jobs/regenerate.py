@@ -8,9 +8,8 @@ from typing import Any
 from rich.console import Console
 
 from levelproof.configs.compose import changed_settings, compose_job
-from levelproof.configs.schema import from_files
+from levelproof.configs.schema import from_files, other_sampler
 from levelproof.experts.procedure import Procedure
-from levelproof.levelgen.identity.keys import SAMPLER_VERSION
 from levelproof.pipeline.errors import Exit, UserError
 from levelproof.pipeline.jobs.generate import generate
 from levelproof.pipeline.read.select import columns_in, select
@@ -61,11 +60,8 @@ def _chosen(source: Path, where: str | None) -> tuple[Mapping[str, Any], list[in
         prepare_jax(device="cpu")
     manifest = require_manifest(source, columns_in(where))
     config = manifest.config or {}
-    if not from_files(config) and config["sampler_version"] != SAMPLER_VERSION:
-        raise UserError(
-            f"The levels of {source} come from sampler version {config['sampler_version']}, but this levelproof has "
-            f"version {SAMPLER_VERSION}: use the levelproof that made them."
-        )
+    if differs := other_sampler(config):
+        raise UserError(f"The split {source} {differs}: use the levelproof that made it.")
     level_ids = select(manifest.table, where).column("level_id").to_pylist()
     if not level_ids:
         raise UserError(f"No level of {source} meets the condition {where!r}: choose others with where.")

@@ -25,7 +25,7 @@ from levelproof.pipeline.store.seed.file import is_seed
 
 ATTEMPTS = 16  # attempts per expert in splits whose configuration does not say
 COMPARED = 64  # levels that are compared with the split's
-ROUNDED = 0.05  # share of them that may differ: a choice may flip where a GPU or an earlier sampler rounded otherwise
+ROUNDED = 0.05  # share of them that may differ: a choice may flip where a GPU rounded otherwise
 
 
 class Specialists(NamedTuple):

@@ -1,6 +1,5 @@
 """Levels of a split by id, level files that users name, and the output files of single levels."""
 
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -9,9 +8,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from levelproof.configs.schema import distribution_in, from_files, rules_in
+from levelproof.configs.schema import distribution_in, other_sampler, rules_in
 from levelproof.levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
-from levelproof.levelgen.identity.keys import ALIKE_VERSIONS, MAX_LEVEL_ID, SAMPLER_VERSION
+from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
 from levelproof.levelgen.level import Level, concatenate_levels, size_of
 from levelproof.levelgen.sampling.sampler import Distribution, on_cpu, sample_levels
 from levelproof.levelgen.task.rules import TaskParams
@@ -66,7 +65,8 @@ def levels_of(manifest: Manifest, rows: pa.Table, in_command: bool = True) -> Le
     up before that; in a program of the user's, JAX keeps the user's settings.
 
     Raises:
-        Failure: a shard is damaged, a file is missing or has changed, or as `recorded_settings`.
+        Failure: a shard is damaged, a file is missing or has changed, another sampler made levels that no shard holds,
+            or as `recorded_settings`.
     """
     stored = rows.column("shard").is_valid().to_numpy()
     size = size_of(rows.column("size")[0].as_py())
@@ -78,7 +78,8 @@ def levels_of(manifest: Manifest, rows: pa.Table, in_command: bool = True) -> Le
         if in_command:
             prepare_jax()
         others, distribution = rows.filter(~stored), distribution_of(manifest)
-        check_sampler(manifest)
+        if differs := other_sampler(manifest.config or {}):
+            raise Failure(f"The split {manifest.split} {differs}: use the levelproof that made it.")
         if distribution is None and is_seed(manifest.split):
             parts.append(stored_levels(manifest.split, others.column("level_id").to_numpy()))
         elif distribution is None:
@@ -89,37 +90,6 @@ def levels_of(manifest: Manifest, rows: pa.Table, in_command: bool = True) -> Le
                 parts.append(sample_levels(others["level_id"].to_numpy(), size, distribution))
     order = np.argsort(np.concatenate([np.flatnonzero(stored), np.flatnonzero(~stored)]))
     return concatenate_levels(parts)[order]
-
-
-class SamplerDiffers(UserWarning):
-    """Levels sampled here differ from their split's in the last digits of their numbers."""
-
-
-def check_sampler(manifest: Manifest) -> None:
-    """Warn with SamplerDiffers if this version's sampler makes other bits from a split's ids than the one that made it.
-
-    Levels with a witness are read from shards, so they have the same bits in any version.
-
-    Raises:
-        Failure: it makes other levels.
-    """
-    made_with = (manifest.config or {}).get("sampler_version")
-    if made_with == SAMPLER_VERSION or from_files(manifest.config or {}):
-        return
-    what = (
-        f"The levels of {manifest.split} were sampled by version {made_with} of the sampler, but this levelproof has "
-        "version"
-    )
-    if made_with not in ALIKE_VERSIONS:
-        raise Failure(
-            f"{what} {SAMPLER_VERSION}, which makes different levels from the same ids: "
-            "use the levelproof that made the split."
-        )
-    warnings.warn(
-        f"{what} {SAMPLER_VERSION}: those without a witness differ in the last digits of their numbers.",
-        SamplerDiffers,
-        stacklevel=3,
-    )
 
 
 def distribution_of(manifest: Manifest) -> Distribution | None:

@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from levelproof.experts.steps import Seconds
 
-MANIFEST_VERSION = 9
+MANIFEST_VERSION = 10
 
 # Columns that depend on the run and not on the level: in all others two runs of a job agree, bit for bit
 OF_THE_RUN = ("shard", "row", "experts", "seconds")
@@ -175,12 +175,7 @@ DESCRIBED = (
         ),
         f"Versions that made the row: {', '.join(STACK)}, and the sampler",
     ),
-    ManifestColumn(
-        "engine",
-        pa.int32(),
-        "Version of the arithmetic of a physics step",
-        null="earlier versions: 1",
-    ),
+    ManifestColumn("engine", pa.int32(), "Version of the arithmetic of a physics step"),
     ManifestColumn("device", pa.string(), "Device that computed the row, such as `cpu: AMD EPYC`"),
     ManifestColumn("command", pa.string(), "Command that regenerates this row"),
     ManifestColumn(

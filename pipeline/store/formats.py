@@ -18,7 +18,6 @@ from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 from levelproof.physics.step import ENGINE_VERSION
 
 SHARD_VERSION = 2
-FIRST_VERSION = 1  # of the sampler and the engine of shards that do not name them
 
 # Keys of a fragment's metadata
 VERSION_KEY = b"levelproof.manifest_version"
@@ -63,7 +62,7 @@ class Encoding:
         """
         try:
             density, key_every = attributes["density"], attributes.get("key_every", KEY_EVERY)
-            made_with = [attributes.get(name, FIRST_VERSION) for name in ("sampler_version", "engine_version")]
+            made_with = [attributes[name] for name in ("sampler_version", "engine_version")]
             encoding = Encoding(density, key_every, typed(TaskParams, attributes["task"]), *made_with)
         except (KeyError, TypeError, ConfigError) as error:
             raise ContentsError("its attributes do not say how records are stored") from error

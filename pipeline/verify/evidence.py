@@ -21,7 +21,6 @@ from levelproof.experts.verdict.before import decide
 from levelproof.experts.witness.witness import Record, replay, steps_to_goal, succeeds
 from levelproof.levelgen.batching import LANES
 from levelproof.levelgen.identity.content import VERSION, content_hashes, level_id_for
-from levelproof.levelgen.identity.keys import SAMPLER_VERSION
 from levelproof.levelgen.identity.signature import signatures
 from levelproof.levelgen.level import Level, size_of
 from levelproof.levelgen.sampling.sampler import Distribution, sample_levels
@@ -34,7 +33,6 @@ from levelproof.pipeline.read.rows import COLUMNS as POSITION_COLUMNS
 from levelproof.pipeline.read.rows import gather_rows
 from levelproof.pipeline.store.bounds import unread
 from levelproof.pipeline.store.fields import arrays_of, same_bits, tree_of, unlike_fields
-from levelproof.pipeline.store.formats import FIRST_VERSION
 from levelproof.pipeline.store.origins import RECORD, origin_of
 from levelproof.pipeline.store.provenance import device, versions
 from levelproof.pipeline.store.seed.file import is_seed
@@ -165,7 +163,7 @@ class Evidence:
     def _check_identities(self, levels: Level) -> Mask:
         """Check that rows describe the levels that their ids make; return which ones match in every bit.
 
-        A row made by another sampler or engine, or not on a CPU, needs only a matching signature; but a world that is
+        A row made by another engine, or not on a CPU, needs only a matching signature; but a world that is
         stored, not made from its id, has the same content hash everywhere.
         """
         rows = list(zip(self.columns["content_hash"], self.columns["signature"], strict=True))
@@ -308,12 +306,11 @@ class Evidence:
 def portable(rows: pa.Table) -> Mask:
     """Return which rows' worlds and records this machine must reproduce bit for bit.
 
-    They are those that this sampler and engine made on a CPU, if this machine also computes on one, of any kind; and
-    those of the same stack.
+    They are those that this engine made on a CPU, if this machine also computes on one, of any kind; and those of the
+    same stack.
     """
-    sampler = _made_with(rows, "sampler", SAMPLER_VERSION)
     on_cpu = np.array([name.startswith("cpu:") for name in rows.column("device").to_pylist()], bool)
-    return same_stack(rows) | (sampler & _same_engine(rows) & on_cpu & device().startswith("cpu:"))
+    return same_stack(rows) | (_same_engine(rows) & on_cpu & device().startswith("cpu:"))
 
 
 def same_stack(rows: pa.Table) -> Mask:
@@ -327,4 +324,4 @@ def _made_with(rows: pa.Table, name: str, version: Any) -> Mask:
 
 
 def _same_engine(rows: pa.Table) -> Mask:
-    return rows.column("engine").fill_null(FIRST_VERSION).to_numpy() == ENGINE_VERSION
+    return rows.column("engine").to_numpy() == ENGINE_VERSION

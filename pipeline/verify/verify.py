@@ -1,7 +1,7 @@
 """Verification of a split: compares every byte with its checksum, regenerates every level from its id or file,
 recomputes every label that needs no expert, and replays every witness.
 
-Worlds and records must match in every bit if this sampler and engine made them on any CPU, or if the same stack
+Worlds and records must match in every bit if this engine made them on any CPU, or if the same stack
 (versions and device) made them. Otherwise a level must match the signature of the one that its id makes, its world
 must match its row's content hash, and its witness must reach the goal.
 """
@@ -19,9 +19,7 @@ import numpy as np
 import pyarrow as pa
 from rich.console import Console
 
-from levelproof.configs.errors import ConfigError
-from levelproof.configs.schema import distribution_in, from_files, rules_in
-from levelproof.levelgen.identity.keys import ALIKE_VERSIONS, SAMPLER_VERSION
+from levelproof.configs.schema import distribution_in, from_files, other_sampler, rules_in
 from levelproof.levelgen.level import size_of
 from levelproof.levelgen.sampling.sampler import CHUNK
 from levelproof.pipeline.errors import Exit, Failure
@@ -249,8 +247,8 @@ def _recipe(split: Path, fragment: Fragment) -> Recipe:
     """Return how to make and play the levels. Raise Failure if this version cannot."""
     config = fragment.config
     with recorded_settings(split):
-        if config["sampler_version"] not in ALIKE_VERSIONS:  # levels of alike versions are compared by signature
-            raise ConfigError(f"sampler version {config['sampler_version']}, but this levelproof has {SAMPLER_VERSION}")
+        if differs := other_sampler(config):
+            raise Failure(f"The split {split} {differs}: use the levelproof that made it.")
         size_of(config["size"])
         return Recipe(split, config["size"], distribution_in(config), rules_in(config))
 

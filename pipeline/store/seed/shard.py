@@ -16,7 +16,7 @@ from levelproof.levelgen.task.observe.kinds import ObservationType
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.density import Restored
 from levelproof.pipeline.store.fields import arrays_of
-from levelproof.pipeline.store.formats import FIRST_VERSION, Encoding, FieldSpec
+from levelproof.pipeline.store.formats import Encoding, FieldSpec
 from levelproof.pipeline.store.mapped import find_table, share_table, whole
 from levelproof.pipeline.store.seed.file import (
     damaged_seed,
@@ -66,7 +66,7 @@ class SeedShard(Shard):
         self.size = self._source.size
         if size not in (None, name_of(self.size)):
             raise Failure(f"The levels of {path} have size {name_of(self.size)}, but {size} was expected.")
-        engine = config.get("engine_version", FIRST_VERSION)
+        engine = config["engine_version"]
         self.encoding = Encoding("witness", rules=self._source.rules, engine_version=engine)
         rows = self._shared("rows", self._read)
         self.level_ids: Any = whole(rows.column("level_id")).to_numpy()

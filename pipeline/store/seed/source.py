@@ -9,16 +9,14 @@ import numpy as np
 from jaxtyping import Int
 
 from levelproof.configs.errors import ConfigError
-from levelproof.configs.schema import MAX_FRAME_SKIP, distribution_in, rules_in
+from levelproof.configs.schema import MAX_FRAME_SKIP, distribution_in, other_sampler, rules_in
 from levelproof.levelgen.batching import block_size, by_blocks
-from levelproof.levelgen.identity.keys import SAMPLER_VERSION
 from levelproof.levelgen.level import Level, size_of
 from levelproof.levelgen.sampling.distribution import Distribution
 from levelproof.levelgen.sampling.sampler import CHUNK, check_size, on_cpu, sample_chunk
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.types import Size
 from levelproof.pipeline.errors import Failure, UserError
-from levelproof.pipeline.store.formats import FIRST_VERSION
 from levelproof.pipeline.store.seed.file import damaged_seed
 from levelproof.pipeline.store.seed.worlds import unpack_worlds
 from levelproof.pipeline.urls import as_typed, quoted
@@ -72,15 +70,12 @@ class LevelSource:
                 raise ConfigError(
                     f"task.frame_skip is {rules.frame_skip}, and seed files have at most {MAX_FRAME_SKIP}"
                 )
-            if not isinstance(config.get("engine_version", FIRST_VERSION), int):
+            if not isinstance(config["engine_version"], int):
                 raise ConfigError("engine_version is not a number")
         except (ValueError, KeyError, TypeError) as error:
             raise ConfigError(f"has settings that this levelproof does not accept ({error})") from None
-        sampler = config.get("sampler_version")
-        if distribution is not None and sampler != SAMPLER_VERSION:
-            raise ConfigError(
-                f"has levels from sampler version {sampler!r:.9}, but this levelproof has version {SAMPLER_VERSION}"
-            )
+        if differs := other_sampler(config):
+            raise ConfigError(differs)
         return LevelSource(path, size, distribution, rules)
 
     def levels(self, level_ids: Int[np.ndarray, " level"], content: Sequence[bytes | None]) -> Level:

@@ -7,11 +7,13 @@ from typing import Any
 
 import pytest
 
+from levelproof.configs import schema
 from levelproof.experts.labels import Label
 from levelproof.pipeline.errors import Failure, UserError
-from levelproof.pipeline.read.levels import COLUMNS, distribution_of, find_level, rules_of
+from levelproof.pipeline.read.levels import COLUMNS, distribution_of, find_level, levels_of, rules_of
 from levelproof.pipeline.store import manifest
 from levelproof.pipeline.store.manifest import Manifest, read_fragment, read_manifest
+from tests.pipeline.command import assert_refused, here
 from tests.pipeline.made import made_split
 
 
@@ -43,3 +45,16 @@ def test_rules_of_and_distribution_of_report_settings_of_another_version(
     config = {group: settings} if settings else {}
     with pytest.raises(Failure, match="does not accept the settings of"):
         read(replace(split_manifest, fragments=(replace(fragment, config=config),)))
+
+
+def test_another_samplers_levels_come_from_shards_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    split = made_split(tmp_path, [[Label.SOLVED, Label.UNSOLVED]])
+    monkeypatch.setattr(schema, "SAMPLER_VERSION", schema.SAMPLER_VERSION + 1)
+    split_manifest = read_manifest(split)
+    assert len(levels_of(split_manifest, split_manifest.table.slice(0, 1))) == 1
+    with pytest.raises(Failure, match="has levels from sampler version 2, but this levelproof has version 3: use"):
+        levels_of(split_manifest, split_manifest.table)
+    regenerate = ["regenerate", f"manifest={split}", "budget=32k"]
+    export = ["export", str(split), "--format", "seed", "-o", "new.parquet"]
+    for code, command in (1, ["verify", str(split)]), (2, regenerate), (2, export):
+        assert_refused(here(command, tmp_path), code, "has levels from sampler version 2")

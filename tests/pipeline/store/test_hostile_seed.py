@@ -124,6 +124,7 @@ CHANGES: dict[str, Callable[[Table, dict[bytes, Any]], Any]] = {
     "a billion steps per action": with_setting("task", {"frame_skip": 10**9}),
     "distribution of another kind": with_setting("distribution", [1, 2]),
     "another sampler": with_setting("sampler_version", 10**6),
+    "no engine": with_setting("engine_version", None),
 }
 
 
