@@ -32,7 +32,7 @@ class Cause(IntEnum):
     """Why an expert stopped training for good."""
 
     NONE = 0  # training has not stopped for good: a larger budget would continue it
-    RUNG = 1  # the best return had not grown; in experts kept by earlier versions, any cause
+    RUNG = 1  # the best return had not grown
     FRUITLESS = 2  # the expert itself had no success after `stop.fruitless` env steps
     DIVERGED = 3  # the expert's parameters were no longer finite
 

@@ -105,9 +105,8 @@ def with_stack(note: dict[str, Any], tell: Callable[[str], None]) -> dict[str, A
     before, now = note[MADE_BY], versions() | learned_with() | {"device": device()}
     if before and before[-1] != now:
         others = ", ".join(f"{name} {value}" for name, value in before[-1].items() if now.get(name) != value)
-        if others:  # else an earlier version of this program noted fewer
-            differs = "so its policy may differ from that of an uninterrupted run"
-            tell(f"This run was last trained with {others}, {differs}.")
+        differs = "so its policy may differ from that of an uninterrupted run"
+        tell(f"This run was last trained with {others}, {differs}.")
     return note | {MADE_BY: before if before[-1:] == [now] else [*before, now]}
 
 

@@ -102,10 +102,9 @@ def unstacked(arrays: Mapping[str, np.ndarray], path: str, like: T, count: int) 
     leaves = []
     for name, one in arrays_of(like, path).items():
         stacked = arrays[name]
-        # Smaller types pass: the cause of an end was a bool in earlier versions
-        if stacked.shape != (count, *one.shape) or not np.can_cast(stacked.dtype, one.dtype):
+        if stacked.shape != (count, *one.shape) or stacked.dtype != one.dtype:
             raise ValueError(f"{name} has another shape or type")
-        leaves.append(stacked.astype(one.dtype, copy=False))
+        leaves.append(stacked)
     return [jax.tree.unflatten(jax.tree.structure(like), [leaf[i] for leaf in leaves]) for i in range(count)]
 
 

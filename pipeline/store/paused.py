@@ -9,7 +9,6 @@ import hashlib
 import io
 import json
 import os
-import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -37,7 +36,6 @@ from levelproof.pipeline.store.layout import (
     CHECKPOINT,
     CHECKPOINT_BEGUN,
     CHECKPOINTS,
-    OLD_CHECKPOINT,
     checkpoint_path,
     entries,
     ids_of,
@@ -135,7 +133,7 @@ def prune_paused(split: Path, done: np.ndarray, say: Callable[[str], None]) -> N
     """
     for path in entries(split, CHECKPOINTS, CHECKPOINT_BEGUN, os.DirEntry.is_file):
         remove(path)
-    paths = [*_paths(split, CHECKPOINT), *_paths(split, OLD_CHECKPOINT)]
+    paths = _paths(split)
     for path, (why, is_over) in zip(paths, at_once(split, lambda path: _judged(path, done), paths), strict=True):
         if is_over:
             remove(path)
@@ -149,8 +147,6 @@ def _judged(path: Path, done: np.ndarray) -> tuple[str, bool]:
     low, high = np.searchsorted(done, [first, last + 1])
     if high - low == last - first + 1:
         return "", True
-    if OLD_CHECKPOINT.fullmatch(f"{CHECKPOINTS}/{path.name}"):
-        return "is from an earlier levelproof and cannot be resumed: it stays until its levels are done", False
     try:
         return "", bool(np.isin(_head(path).level_ids, done).all())
     except FileNotFoundError:
@@ -163,12 +159,12 @@ def _judged(path: Path, done: np.ndarray) -> tuple[str, bool]:
 
 def _paths_of(split: Path, level_ids: set[int]) -> list[Path]:
     """List the checkpoints whose names may include some of these levels."""
-    spans = [(path, *ids_of(path)) for path in _paths(split, CHECKPOINT)]
+    spans = [(path, *ids_of(path)) for path in _paths(split)]
     return [path for path, first, last in spans if any(first <= level_id <= last for level_id in level_ids)]
 
 
-def _paths(split: Path, pattern: re.Pattern[str]) -> list[Path]:
-    return sorted(entries(split, CHECKPOINTS, pattern, os.DirEntry.is_file))
+def _paths(split: Path) -> list[Path]:
+    return sorted(entries(split, CHECKPOINTS, CHECKPOINT, os.DirEntry.is_file))
 
 
 def _reason(error: Exception) -> str:

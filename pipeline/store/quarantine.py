@@ -67,7 +67,7 @@ def _left_of(note: Path, done: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _levels_in(note: Path) -> list[tuple[int, int]]:
-    """Read the runs of level ids in a note's first line; none from an earlier version, or if it cannot be read."""
+    """Read the runs of level ids in a note's first line; none if it cannot be read."""
     try:
         if is_remote(note):
             data, _ = objects.begin_of(note, MAX_LINE)

@@ -220,12 +220,9 @@ def test_prune_reads_heads_alone(split: Path) -> None:
 
 def test_prune_keeps_a_checkpoint_of_another_version(split: Path) -> None:
     path = checkpoint_path(split, UNIT)
-    older = path.with_suffix(".npz")
-    older.write_bytes(b"PK of an earlier version")
     path.write_bytes(path.read_bytes().replace(b"checkpoint 1 ", b"checkpoint 2 ", 1))
-    newer, old = pruned(split, 7)
+    (newer,) = pruned(split, 7)
     assert f"{path} cannot be read (it has version 2, but this levelproof reads 1)" in newer
-    assert f"{older} is from an earlier levelproof and cannot be resumed" in old
     with pytest.raises(CheckpointUnread, match="version 2"):
         load_paused(split, range(8), JOB)
     assert pruned(split, *range(3, 8)) == []
