@@ -225,7 +225,7 @@ def made_split(folder: Path, size: str, levels: int) -> Path:
         level = jax.tree.map(np.asarray, sample_levels(ids, size_of(size), job.distribution))
         verdicts = [
             Verdict(
-                Label.SOLVED, "random actions", False, Source.SCOUT, steps_to_goal=int(steps[i]), env_steps=int(spent)
+                Label.SOLVED, "random actions", False, Source.SEARCH, steps_to_goal=int(steps[i]), env_steps=int(spent)
             )
             if solved[i] and not first
             else Verdict(Label.UNSOLVED, "not played", False, success_rate=0.0, env_steps=int(spent))

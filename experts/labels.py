@@ -22,7 +22,6 @@ class Source(StrEnum):
     MOST_PROBABLE = "most probable"  # the expert's most probable actions
     SAMPLED = "sampled"  # actions sampled from the expert's policy in its evaluation
     EXPLORATION = "exploration"  # actions of an episode of training
-    SCOUT = "scout"  # random play before training, in splits of earlier versions
     SEARCH = "search"  # search before training, or around another witness
     NOTHING = "nothing"  # doing nothing, in a trivial level
     IMPORT = "import"  # actions from another program's data
@@ -39,7 +38,6 @@ class Cause(IntEnum):
 
 MADE_BY = {
     Source.EXPLORATION: "actions of training",
-    Source.SCOUT: "actions of random play",
     Source.SEARCH: "actions of the search",
 }
 UNTRAINED = "no search reached the goal, and the procedure trains no expert"
@@ -71,7 +69,6 @@ class Verdict:
     episodes: int = 0  # of training
     portability: float | None = None  # share of the witness's replays from perturbed starts that reach the goal
     evaluation_steps: int = 0  # env steps
-    scout_steps: int = 0  # 0; earlier versions played at random before training
     search_steps: int = 0  # env steps
     cells: int | None = None  # cells that the search reached; None: not searched
     still_grew: bool | None = None  # whether the archive was still growing when the search ended

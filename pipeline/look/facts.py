@@ -14,7 +14,6 @@ from levelproof.pipeline.tables import folded
 NAMES = 33  # characters; column where the text of a line begins
 REASONS = 4  # shown per label; the rest are only counted
 STEPS = {  # columns of env steps, by stage, and what takes them
-    "scout_steps": "random play",
     "search_steps": "search",
     "env_steps": "training",
     "evaluation_steps": "evaluation",

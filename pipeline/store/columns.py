@@ -79,7 +79,7 @@ DESCRIBED = (
         pa.string(),
         "Source of the witness: `most probable` or `sampled` actions of the expert, `exploration` (an episode of "
         "training), `search` (before training, or around another witness), `nothing` (a trivial level), `import` "
-        "(another program's data), `scout` (earlier versions only: random play before training)",
+        "(another program's data)",
         null=NO_WITNESS,
     ),
     # Null instead of NaN for what was not measured: in SQL, NaN is greater than every number
@@ -135,9 +135,6 @@ DESCRIBED = (
         pa.int64(),
         "Steps of the expert's evaluations and of the attempts of success_rate",
         "env steps",
-    ),
-    ManifestColumn(
-        "scout_steps", pa.int64(), "Steps of random play before training, in earlier versions; now 0", "env steps"
     ),
     ManifestColumn(
         "search_steps", pa.int64(), "Steps of the search before training and around the witness", "env steps"

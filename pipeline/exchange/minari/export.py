@@ -69,7 +69,7 @@ def export_minari(split: Path, where: str | None, out: Path, kind: ActionKind = 
                 "total_steps": steps,
                 "dataset_size": float(storage.get_size()),
                 "author": {f"levelproof {__version__}"},
-                "algorithm_name": "PPO experts of one level each, random play and search; replayed",
+                "algorithm_name": "PPO experts of one level each, and search; replayed",
                 "description": f"Witnesses of {many(rows.num_rows, 'level')} of size {size}, made with a budget of "
                 f"{budget} env steps per level. {own}infos has success, level_id, and which entries of an action "
                 "do something. " + (f"Six entries of an action: {UNRAVEL}" if kind == ActionKind.COMBINED else ""),

@@ -38,7 +38,7 @@ MADE_FROM: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("versions", "engine", "device"), ("made_with",)),
 }
 MANY = 20_000  # levels that take a while to hash
-COSTS = ("env_steps", "evaluation_steps", "scout_steps", "search_steps", "episodes")  # left out: 0 when read
+COSTS = ("env_steps", "evaluation_steps", "search_steps", "episodes")  # left out: 0 when read
 Each = Callable[[pa.Table], pa.Table]
 
 

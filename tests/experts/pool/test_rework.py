@@ -38,7 +38,7 @@ def levels() -> Level:
 @cache
 def witnesses() -> list[Witness]:
     pairs = zip(*random_successes(levels(), IDS), strict=True)
-    successes = [witness for pair in pairs for witness in repeating(Success(*pair), Source.SCOUT)]
+    successes = [witness for pair in pairs for witness in repeating(Success(*pair), Source.EXPLORATION)]
     shares = survival(levels(), IDS, successes, 32, DEFAULT_RULES).tolist()
     return [witness._replace(portability=share) for witness, share in zip(successes, shares, strict=True)]
 
@@ -75,7 +75,7 @@ def test_rework_keeps_an_experts_own_witness_unless_most_replays_fail() -> None:
     """The same actions are varied, whatever their source."""
     fragile, own = witnesses()[FRAGILE], Source.SAMPLED
     assert fragile.portability is not None
-    for source, share, stays in ((own, 0.5, True), (own, 0.45, False), (Source.SCOUT, 0.5, False)):
+    for source, share, stays in ((own, 0.5, True), (own, 0.45, False), (Source.EXPLORATION, 0.5, False)):
         before = fragile._replace(source=source, portability=share)
         some = take(levels(), np.array([FRAGILE]))
         (after,), _ = rework(some, IDS[[FRAGILE]], [before], PROCEDURE, DEFAULT_RULES)

@@ -57,7 +57,7 @@ def test_witness_counts_only_if_its_replay_takes_as_many_steps() -> None:
 
 def test_best_witness_is_the_first_attempt_without_failure() -> None:
     one = evaluation([(9, True), (20, False)], [(99, True), (199, True)], [(30, True)])
-    witness = best_of([one], Source.SCOUT, replace(CONFIG, replays=0))
+    witness = best_of([one], Source.SEARCH, replace(CONFIG, replays=0))
     assert witness is not None
     assert (witness.source, witness.steps) == (Source.SAMPLED, 100)
     np.testing.assert_array_equal(witness.action[:, 0], np.arange(RECORD_STEPS) + 1000)
@@ -65,7 +65,7 @@ def test_best_witness_is_the_first_attempt_without_failure() -> None:
 
 def test_choice_shortest_repeats_the_shortest_success() -> None:
     one = evaluation([(9, True), (14, True), (20, False)], [(99, True)], [(30, True)])
-    witness = best_of([one], Source.SCOUT, replace(CONFIG, witness=Choice.SHORTEST))
+    witness = best_of([one], Source.SEARCH, replace(CONFIG, witness=Choice.SHORTEST))
     assert witness is not None
     assert (witness.source, witness.steps) == (Source.MOST_PROBABLE, 5)
     np.testing.assert_array_equal(witness.action[:12, 0], [10, 11, 12, 13, 14] * 2 + [10, 11])
@@ -75,7 +75,7 @@ def test_candidates_come_from_all_evaluations() -> None:
     before, polished = evaluation([(99, True)]), evaluation([(49, True)])
     failed = evaluation([(9, False)])
     for several in ([before, polished], [polished, before], [polished, failed]):
-        witness = best_of(several, Source.SCOUT, CONFIG)
+        witness = best_of(several, Source.SEARCH, CONFIG)
         assert witness is not None
         assert witness.steps == 50
 
@@ -84,9 +84,9 @@ def test_candidates_are_all_successes_shortest_first() -> None:
     one, two = evaluation([(99, True)], [(9, True), (29, False)], [(30, True)]), evaluation([(30, True)], [(20, True)])
     steps = lambda candidates: [(witness.steps, witness.source) for witness in candidates]
     sampled, probable = Source.SAMPLED, Source.MOST_PROBABLE
-    candidates = candidates_of([one, two], Source.SCOUT, CONFIG)
+    candidates = candidates_of([one, two], Source.SEARCH, CONFIG)
     assert steps(candidates) == [(21, sampled), (31, sampled), (31, probable), (100, probable)]
-    assert steps(candidates_of([one, two], Source.SCOUT, replace(CONFIG, replays=0))) == [
+    assert steps(candidates_of([one, two], Source.SEARCH, replace(CONFIG, replays=0))) == [
         (31, probable),
         (100, probable),
     ]
@@ -98,28 +98,28 @@ def test_candidates_are_the_shortest_without_copies() -> None:
     config = replace(CONFIG, witness=Choice.SHORTEST)
     ends = [(end, True) for end in np.cumsum(np.arange(20, 8, -1)).tolist()]
     one = evaluation(ends)
-    candidates = candidates_of([one, one, one], Source.SCOUT, config)
+    candidates = candidates_of([one, one, one], Source.SEARCH, config)
     assert [witness.steps for witness in candidates] == [n for n in [*range(9, 20), 21] for _ in "123"]
     whole = [[(end, True)] for end in range(40, 10, -1)]
     many = replace(CONFIG, environments=len(whole), attempts=len(whole), sticky_attempts=0, perturbed_attempts=0)
-    shortest = candidates_of([evaluation(*whole, config=many)], Source.SCOUT, many)
+    shortest = candidates_of([evaluation(*whole, config=many)], Source.SEARCH, many)
     assert [witness.steps for witness in shortest] == list(range(12, 12 + MAX_CANDIDATES))
-    assert len(candidates_of([one], Source.SCOUT, replace(config, replays=0))) == 1
+    assert len(candidates_of([one], Source.SEARCH, replace(config, replays=0))) == 1
     copies = evaluation(*[[(9, True), (19, True), (29, True)]] * 3)
     copies.action[:] = 1
-    assert [witness.steps for witness in candidates_of([copies], Source.SCOUT, config)] == [10]
+    assert [witness.steps for witness in candidates_of([copies], Source.SEARCH, config)] == [10]
 
 
 def test_rehearsed_success_is_a_candidate_only_if_allowed_and_without_others() -> None:
     failed, solved = evaluation([(9, False)], success=4), evaluation([(9, True)], success=4)
-    assert best_of([failed], Source.SCOUT, replace(CONFIG, exploration=False)) is None
-    assert best_of([evaluation([(9, False)])], Source.SCOUT, CONFIG) is None
-    rehearsed, own = best_of([failed], Source.SCOUT, CONFIG), best_of([solved], Source.SCOUT, CONFIG)
+    assert best_of([failed], Source.SEARCH, replace(CONFIG, exploration=False)) is None
+    assert best_of([evaluation([(9, False)])], Source.SEARCH, CONFIG) is None
+    rehearsed, own = best_of([failed], Source.SEARCH, CONFIG), best_of([solved], Source.SEARCH, CONFIG)
     assert rehearsed is not None
     assert own is not None
-    assert (rehearsed.source, rehearsed.steps) == (Source.SCOUT, 4)
+    assert (rehearsed.source, rehearsed.steps) == (Source.SEARCH, 4)
     assert own.source is Source.MOST_PROBABLE
-    assert [witness.source for witness in candidates_of([solved], Source.SCOUT, CONFIG)] == [own.source]
+    assert [witness.source for witness in candidates_of([solved], Source.SEARCH, CONFIG)] == [own.source]
 
 
 def test_shares_count_first_episodes_of_each_kind_of_attempt() -> None:

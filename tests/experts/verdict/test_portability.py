@@ -42,7 +42,7 @@ def witnesses(levels: Level) -> list[Witness]:
     at = np.arange(FOUND)
     success = random_successes(take(levels, at), IDS[at])
     each = zip(success.action, success.length, strict=True)
-    return [witness for pair in each for witness in repeating(Success(*pair), Source.SCOUT)]
+    return [witness for pair in each for witness in repeating(Success(*pair), Source.SEARCH)]
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ def split_of(folder: Path, labels: list[Label], budget: str = "64k", steps: int 
     split = split_path(job.out, job.budget, job.size)
     split.mkdir(parents=True)
     result = made_result(ids, labels)
-    cost = {"env_steps": 100 * steps, "scout_steps": 5}
+    cost = {"env_steps": 100 * steps, "search_steps": 5}
     verdicts = [
         replace(verdict, **cost, steps_to_goal=steps + i if verdict.label == S else None)
         for i, verdict in enumerate(result.verdicts)

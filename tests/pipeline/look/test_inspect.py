@@ -73,7 +73,7 @@ def test_survey_reads_only_needed_columns(split: Path, monkeypatch: pytest.Monke
     facts = survey(split, RowQuery("env_steps > 0 AND level_id >= 4", limit=2))
     assert [row["level_id"] for row in facts["rows"]] == [4, 5]
     assert facts["rows"][0].keys() == set(COLUMNS.names)
-    assert sorted(read) == [(4, 16)] * 3 + [(4, len(COLUMNS))]
+    assert sorted(read) == [(4, 15)] * 3 + [(4, len(COLUMNS))]
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_survey_counts_reasons_witnesses_and_steps(split: Path) -> None:
     facts = survey(split)
     assert facts["reasons"] == {label: {"made for a test": 3} for label in LABELS}
     assert facts["witness"] == {"sampled": 3}
-    assert [facts[f"{stage}_steps"] for stage in ("env", "scout", "search", "evaluation")] == [12 * 4096, 0, 0, 0]
+    assert [facts[f"{stage}_steps"] for stage in ("env", "search", "evaluation")] == [12 * 4096, 0, 0]
     low, high = facts["solve_interval"]
     assert 0.15 < low < facts["solve_rate"] == 0.5 < high < 0.85
     assert kind_of_reason("doing nothing reaches the goal in 12 env steps, or 1,024") == (
