@@ -397,7 +397,7 @@ def test_export_refuses_settings_that_no_seed_file_can_have(
     skipping, out = made_split(tmp_path / "skipping", [[Label.SOLVED]], "task.frame_skip=100"), tmp_path / "no.parquet"
     with pytest.raises(UserError, match=r"task.frame_skip is 100, and seed files have at most 64\): export it to"):
         export_seed(skipping, None, out)
-    monkeypatch.setattr("levelproof.pipeline.store.seed.source.SAMPLER_VERSION", 99)
+    monkeypatch.setattr("levelproof.configs.schema.SAMPLER_VERSION", 99)
     with pytest.raises(UserError, match="but this levelproof has version 99: export it"):
         export_seed(split, None, out)
     assert not out.exists()
