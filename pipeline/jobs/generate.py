@@ -17,7 +17,7 @@ from levelproof.pipeline.errors import Exit, UserError
 from levelproof.pipeline.jobs.choice import runs_here
 from levelproof.pipeline.jobs.events import Events, recording
 from levelproof.pipeline.jobs.log import logged, require_library
-from levelproof.pipeline.jobs.progress import Board, Tally, say
+from levelproof.pipeline.jobs.progress import Board, Tally
 from levelproof.pipeline.jobs.schedule import Scheduler, UnitOutcome, WorkUnit, levels_text, schedule
 from levelproof.pipeline.jobs.seal import Sealer, sealing
 from levelproof.pipeline.read.level_files import Listing, levels_below
@@ -30,6 +30,7 @@ from levelproof.pipeline.store.layout import quarantine_path
 from levelproof.pipeline.store.manifest import Manifest, read_manifest
 from levelproof.pipeline.store.origins import Origin, require_same_levels
 from levelproof.pipeline.store.paused import prune_paused
+from levelproof.pipeline.store.progress_bar import say
 from levelproof.pipeline.store.runs import ascending, inside, merged, runs
 from levelproof.pipeline.store.split import writing
 from levelproof.pipeline.urls import as_typed, quoted

@@ -11,10 +11,10 @@ from levelproof.configs.compose import compose_job
 from levelproof.configs.schema import GrowConfig, from_files
 from levelproof.pipeline.errors import Exit, Failure, UserError
 from levelproof.pipeline.jobs.generate import generate
-from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.jobs.schedule import WorkUnit, levels_text
 from levelproof.pipeline.store import quarantine
 from levelproof.pipeline.store.manifest import read_manifest, require_manifest
+from levelproof.pipeline.store.progress_bar import say
 from levelproof.pipeline.store.remote import absolute, as_typed
 from levelproof.pipeline.store.seed.columns import ROW_GROUP
 from levelproof.pipeline.store.seed.file import is_seed, read_seed, seed_files

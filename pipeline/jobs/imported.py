@@ -22,7 +22,6 @@ from levelproof.experts.verdict.given import label_given
 from levelproof.levelgen.batching import LANES, take
 from levelproof.levelgen.level import name_of
 from levelproof.pipeline.errors import Exit, Failure, UserError
-from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.seal import sealing
 from levelproof.pipeline.jobs.unit import commit
@@ -35,7 +34,7 @@ from levelproof.pipeline.store.job_note import note_job
 from levelproof.pipeline.store.layout import ids_of, split_path
 from levelproof.pipeline.store.manifest import Manifest, any_within, read_manifest
 from levelproof.pipeline.store.origins import Origin, RecordPlace, can_be_noted
-from levelproof.pipeline.store.progress_bar import ProgressBar
+from levelproof.pipeline.store.progress_bar import ProgressBar, say
 from levelproof.pipeline.store.remote import require_folder
 from levelproof.pipeline.store.runs import runs
 from levelproof.pipeline.store.seed.file import is_seed

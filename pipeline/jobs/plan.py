@@ -22,7 +22,6 @@ from levelproof.pipeline.jobs.address import on_this_machine
 from levelproof.pipeline.jobs.choice import most_workers, runs_here, workers_here
 from levelproof.pipeline.jobs.forecast import LIKELY, Forecast, PerWitness, Sample, forecast
 from levelproof.pipeline.jobs.generate import generate
-from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.read.select import labelled
 from levelproof.pipeline.runtime import own_cores, prepare_jax
@@ -30,6 +29,7 @@ from levelproof.pipeline.store.event_files import events_of, runs_in
 from levelproof.pipeline.store.formats import Encoding
 from levelproof.pipeline.store.layout import EXPERTS, split_path
 from levelproof.pipeline.store.manifest import read_manifest
+from levelproof.pipeline.store.progress_bar import say
 from levelproof.pipeline.store.scratch import scratch
 from levelproof.pipeline.store.shard import stored_bytes, write_shard
 from levelproof.pipeline.words import duration, many

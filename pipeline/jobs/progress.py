@@ -2,17 +2,16 @@
 
 import time
 from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress
 
 from levelproof.experts.steps import NO_SECONDS, EnvSteps, Seconds
 from levelproof.pipeline.jobs.schedule import Round, Summary, WorkUnit
-from levelproof.pipeline.store.progress_bar import LINE_EVERY
+from levelproof.pipeline.store.progress_bar import LINE_EVERY, TextBar, say
 from levelproof.pipeline.words import duration
 
 LINE_AFTER = 2.0  # s between plain lines that report commits; the last commit is always reported
@@ -84,19 +83,13 @@ class Tally:
         return f"{self.decided:,}/{self.levels:,} levels · {self.solved_so_far:,} solved · {tail}"
 
 
-def say(console: Console, text: str) -> None:
-    """Print a permanent line verbatim."""
-    console.print(text, highlight=False, markup=False, soft_wrap=True)
-
-
 class Board:
     """Shows a Tally: a bar on a terminal, plain lines now and then elsewhere."""
 
     def __init__(self, tally: Tally, console: Console, clock: Callable[[], float] = time.monotonic) -> None:
-        self.tally, self._console, self._line_at = tally, console, 0.0
-        columns = BarColumn(), TaskProgressColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
-        self._bar = Progress(*columns, console=console)
-        self._task = self._bar.add_task("starting", total=1)
+        self.tally, self._console = tally, console
+        self._bar = TextBar(console, "starting", 1)
+        self._bar.line_at = 0.0  # the first refresh prints a line
         # For estimates only; they begin with the first env steps of this run, so compiling does not count
         self._pace = Progress(get_time=clock, speed_estimate_period=PACE_OVER, disable=True)
         self._steps = self._pace.add_task("env steps", total=None)
@@ -105,8 +98,9 @@ class Board:
         self._unsaved = False  # whether the user knows that experts could not be saved
         self.watchers: list[Callable[[float, float | None], None]] = []  # get env steps/s and s to go, at each refresh
 
-    def shown(self) -> AbstractContextManager[object]:
-        return self._bar if self._console.is_interactive else nullcontext()
+    def shown(self) -> TextBar:
+        """Return the bar, for a `with` block."""
+        return self._bar
 
     def refresh(self, every: float = LINE_EVERY, working: bool = True) -> None:
         """Update the bar, or print a line unless one was printed in the last `every` seconds.
@@ -121,12 +115,7 @@ class Board:
         rate, left = (steps.speed or 0.0, levels.time_remaining) if working else (0.0, None)
         for watcher in self.watchers:
             watcher(rate, left)
-        text, now = self.tally.text(rate, left), time.monotonic()
-        if self._console.is_interactive:
-            self._bar.update(self._task, completed=self.tally.share, description=text)
-        elif now - self._line_at >= every:
-            self._line_at = now
-            self.say(text)
+        self._bar.show(self.tally.share, self.tally.text(rate, left), every)
 
     def say(self, text: str) -> None:
         """Print a permanent line."""

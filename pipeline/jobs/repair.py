@@ -15,7 +15,6 @@ from levelproof.configs.numbers import parse_count
 from levelproof.configs.schema import JobConfig, from_files, hash_of
 from levelproof.pipeline.errors import Exit, Failure, UserError
 from levelproof.pipeline.jobs.generate import generate
-from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.read.levels import recorded_settings
 from levelproof.pipeline.runtime import in_another_process, own_cores
 from levelproof.pipeline.stopping import stoppable
@@ -23,6 +22,7 @@ from levelproof.pipeline.store.job_note import note_job, sound_note
 from levelproof.pipeline.store.layout import EXPERTS, data_paths, fragment_files
 from levelproof.pipeline.store.locks import is_written, without_commits
 from levelproof.pipeline.store.mend import take_out
+from levelproof.pipeline.store.progress_bar import say
 from levelproof.pipeline.store.runs import merged, runs, runs_text
 from levelproof.pipeline.store.split import locked, taken
 from levelproof.pipeline.verify.findings import Findings, why_not_repaired

@@ -11,7 +11,6 @@ from rich.console import Console
 
 from levelproof.configs.schema import KEY_EVERY, KEYS_EVERY, Density, stored_as
 from levelproof.pipeline.errors import LevelproofError, UserError
-from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store import seal as store
@@ -20,7 +19,7 @@ from levelproof.pipeline.store.disk import explaining_writes
 from levelproof.pipeline.store.job_note import note_density
 from levelproof.pipeline.store.layout import fragment_path, unit_name
 from levelproof.pipeline.store.manifest import Fragment, require_manifest
-from levelproof.pipeline.store.progress_bar import ProgressBar
+from levelproof.pipeline.store.progress_bar import ProgressBar, say
 from levelproof.pipeline.store.scratch import written_disk
 from levelproof.pipeline.store.seal import Piece, seal
 from levelproof.pipeline.store.split import taken

@@ -20,14 +20,12 @@ from levelproof.physics.types import Size
 from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.dataset.subsets import TRAIN, VALIDATION, in_subset
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.learn.curves import BLUE, GREEN, Curves, Panel
 from levelproof.pipeline.learn.folder import (
     continued,
     origin_of,
     require_same_run,
     settings_without,
-    shown,
     tell_done,
     writing_run,
 )
@@ -36,7 +34,7 @@ from levelproof.pipeline.learn.pool import Feed, PartedSplit, validation_batches
 from levelproof.pipeline.learn.run import Run, recorded
 from levelproof.pipeline.learn.sealed import require_not_sealed, without_sealed
 from levelproof.pipeline.runtime import prepare_jax
-from levelproof.pipeline.store.progress_bar import ProgressBar
+from levelproof.pipeline.store.progress_bar import ProgressBar, TextBar, say
 from levelproof.pipeline.words import duration
 
 SOLVED = "eval/sampled_episode_solve_rate"
@@ -148,9 +146,9 @@ def train(
         say(console, text)
     with ProgressBar("levels read", feed.levels, console) as bar:
         batches = feed.batches(first, feed.read(first, bar.advance))
-    with closing(batches), shown(console, "reading validation levels", last, first) as show:
+    with closing(batches), TextBar(console, "reading validation levels", last, first) as bar:
         held = {str(source.data.split): held_of(source, config) for source in sources}
-        show(0, "compiling")
+        bar.show(first, "compiling")
         for update, batch in enumerate(batches, first + 1):
             state, likeness = imitate(state, batch, config.network, config.train)
             recent.append(likeness)
@@ -166,7 +164,7 @@ def train(
                     recent = []
                     run.keep(state, numbers, "bc/loss", "train.learning_rate")
                 words = f"{line_of(update, last, numbers)}{speed}"
-            show(1, words, keep)
+            bar.show(update, words, keep=keep)
     return state
 
 

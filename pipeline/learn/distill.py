@@ -23,14 +23,12 @@ from levelproof.experts.networks.saved import Policy
 from levelproof.levelgen.batching import take
 from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.learn.curves import BLUE, GREEN, YELLOW, Curves, Panel
 from levelproof.pipeline.learn.folder import (
     continued,
     origin_of,
     require_same_run,
     settings_without,
-    shown,
     tell_done,
     weights_digest,
     writing_run,
@@ -45,7 +43,7 @@ from levelproof.pipeline.learn.sealed import require_not_sealed, require_some_us
 from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.read.select import labelled
 from levelproof.pipeline.runtime import prepare_jax
-from levelproof.pipeline.store.progress_bar import ProgressBar
+from levelproof.pipeline.store.progress_bar import ProgressBar, TextBar, say
 from levelproof.pipeline.words import duration
 
 COURSE = Curves(
@@ -208,9 +206,9 @@ def update_until_done(
     """
     last, first = config.train.updates, int(now.imitation.updates)
     pace = Pace()
-    with shown(console, "compiling", last, first) as show:
+    with TextBar(console, "compiling", last, first) as bar:
         for update in range(first, last, config.interval):
-            show(0, f"{update:,}/{last:,} updates · asking teachers")
+            bar.show(update, f"{update:,}/{last:,} updates · asking teachers")
             number = update // config.interval
             labels, numbers = teach(taught, config, network, now.imitation.average, now.labels, number)
             now = now._replace(labels=labels)
@@ -229,7 +227,7 @@ def update_until_done(
             if rate := pace.count(until - update):
                 words += f" · about {duration((last - until) / rate)} left"
             run.keep(now, numbers, "distill/loss", "train.learning_rate")
-            show(until - update, words, keep=True)
+            bar.show(until, words, keep=True)
     return now
 
 

@@ -24,7 +24,6 @@ from levelproof.experts.networks.saved import BUILTIN, CONFIG, Policy
 from levelproof.levelgen.level import SIZES, name_of
 from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.learn.looks import LOOKS, SEALED, log_look
 from levelproof.pipeline.learn.measured import MeasuredLevels, is_split, levels_in, midway_levels, sealed_levels
 from levelproof.pipeline.learn.published import AGENTS, PROTOCOLS, published_levels
@@ -35,7 +34,7 @@ from levelproof.pipeline.read.agents import SUFFIX as AGENT_SUFFIX
 from levelproof.pipeline.read.agents import Agent, agent_in
 from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.runtime import prepare_jax
-from levelproof.pipeline.store.progress_bar import ProgressBar
+from levelproof.pipeline.store.progress_bar import ProgressBar, say
 from levelproof.pipeline.tables import console_for_tables, folded
 from levelproof.pipeline.urls import as_typed
 from levelproof.pipeline.words import many

@@ -1,9 +1,8 @@
-"""A training run's folder: its note (`run.json`), checkpoint and policy. Also the run's progress bar."""
+"""A training run's folder: its note (`run.json`), checkpoint and policy."""
 
 import hashlib
 import json
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import reduce
@@ -12,8 +11,6 @@ from typing import Any, TypeVar
 
 import jax
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
@@ -23,13 +20,11 @@ from levelproof.experts.networks.saved import CONFIG, WEIGHTS, Policy, named, po
 from levelproof.levelgen.level import name_of
 from levelproof.physics.types import Size
 from levelproof.pipeline.errors import Failure, UserError
-from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.learn.metrics import METRICS
 from levelproof.pipeline.store.disk import NotRegular, explaining_writes, read_regular
 from levelproof.pipeline.store.files import write
 from levelproof.pipeline.store.locks import only_trainer
 from levelproof.pipeline.store.manifest import changes_text, differences
-from levelproof.pipeline.store.progress_bar import LINE_EVERY
 from levelproof.pipeline.store.provenance import device, learned_with, versions
 from levelproof.pipeline.urls import quoted
 
@@ -214,24 +209,3 @@ def keep_run(out: Path, policy: Policy, state: Any) -> None:
         )
     write(out / CHECKPOINT, save(named(state)), durable=True)
     save_policy(out, policy)
-
-
-@contextmanager
-def shown(console: Console, first: str, total: int, completed: int) -> Iterator[Callable[..., None]]:
-    """Show a bar on a terminal, with the text `first`, and elsewhere a line every LINE_EVERY seconds.
-
-    Yields a function that advances the bar by a count and changes its text; with `keep` the text also stays as a line.
-    """
-    columns = BarColumn(), TaskProgressColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
-    with Progress(*columns, console=console, disable=not console.is_interactive) as bar:
-        task = bar.add_task(first, total=total, completed=completed)
-        line_at = time.monotonic()
-
-        def show(count: int, text: str, keep: bool = False) -> None:
-            nonlocal line_at
-            bar.update(task, advance=count, description=text)
-            if keep or (not console.is_interactive and time.monotonic() - line_at >= LINE_EVERY):
-                line_at = time.monotonic()
-                say(console, text)
-
-        yield show

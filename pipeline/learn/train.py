@@ -22,7 +22,6 @@ from levelproof.levelgen.sampling.sampler import Sampler
 from levelproof.levelgen.task.lanes import Table
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.jobs.progress import say
 from levelproof.pipeline.learn.curves import BLUE, GREEN, Curves, Panel
 from levelproof.pipeline.learn.folder import (
     continued,
@@ -30,7 +29,6 @@ from levelproof.pipeline.learn.folder import (
     origin_of,
     require_same_run,
     settings_without,
-    shown,
     tell_done,
     weights_digest,
     writing_run,
@@ -40,6 +38,7 @@ from levelproof.pipeline.learn.run import Run, recorded
 from levelproof.pipeline.learn.trained_on import TrainingLevels, levels_for
 from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.runtime import own_cores, prepare_jax
+from levelproof.pipeline.store.progress_bar import TextBar, say
 from levelproof.pipeline.words import duration, many
 
 COURSE = Curves(
@@ -181,7 +180,7 @@ def update_until_done(
     last, first, per_update = recipe.ppo.updates, int(learner.updates), recipe.ppo.steps_per_update
     pace, recent = Pace(), []
     every = recipe.curriculum.every
-    with shown(console, "compiling", last, first) as show:
+    with TextBar(console, "compiling", last, first) as bar:
         for update in range(first + 1, last + 1):
             if every and (update - 1) % every == 0:
                 learner = programs.between_updates(learner, table)
@@ -201,7 +200,7 @@ def update_until_done(
                     numbers["train/env_steps_per_second"] = rate or np.nan  # unknown
                     recent = []
                     run.keep(learner, numbers, "loss/value", "ppo.learning_rate")
-            show(1, words, keep)
+            bar.show(update, words, keep=keep)
     return learner
 
 

@@ -10,6 +10,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import islice
 from os import DirEntry
 from pathlib import Path
@@ -56,7 +57,7 @@ from levelproof.pipeline.store.manifest import (
 )
 from levelproof.pipeline.store.named import open_shard
 from levelproof.pipeline.store.origins import RECORD, origin_of
-from levelproof.pipeline.store.progress_bar import ProgressBar
+from levelproof.pipeline.store.progress_bar import ProgressBar, say
 from levelproof.pipeline.store.remote import is_listed, is_remote, stale_index
 from levelproof.pipeline.store.runs import runs, runs_text, without
 from levelproof.pipeline.store.seed.file import is_seed
@@ -160,8 +161,7 @@ def _summed(split: Path, groups: Sequence[FragmentGroup], console: Console | Non
     findings.names_experts = any(name.startswith(f"{EXPERTS}/") for name in named)
     present = np.unique(np.concatenate([np.zeros(0, np.int64), *(ids for group in groups for ids in group.ids)]))
     findings.present = runs(present)
-    say = lambda text: console and console.print(text, highlight=False, markup=False, soft_wrap=True)
-    running = not complete or is_written(split, say)
+    running = not complete or is_written(split, partial(say, console))
     _find_lost_levels(split, note, present, named, running, findings)
     if not running:
         _check_index(split, findings)

@@ -10,6 +10,7 @@ from levelproof.experts.steps import EnvSteps
 from levelproof.pipeline.jobs import progress
 from levelproof.pipeline.jobs.progress import Board, Tally
 from levelproof.pipeline.jobs.schedule import Round, Summary, WorkUnit
+from levelproof.pipeline.store import progress_bar
 from levelproof.pipeline.words import duration, number
 
 UNIT = WorkUnit(tuple(range(16)))
@@ -119,7 +120,7 @@ def test_board_takes_no_pace_from_two_moments() -> None:
 
 
 def test_board_prints_few_lines_without_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: 1000.0))
+    monkeypatch.setattr(progress_bar, "time", SimpleNamespace(monotonic=lambda: 1000.0))
     text = io.StringIO()
     board = Board(tally(), Console(file=text))
     with board.shown():

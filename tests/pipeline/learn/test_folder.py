@@ -1,8 +1,6 @@
-"""The folder of a run: what is never overwritten, and what its bar prints."""
+"""The folder of a run: what is never overwritten."""
 
-import io
 import shutil
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +8,6 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from rich.console import Console
 
 import levelproof
 from levelproof.experts.networks.saved import WEIGHTS
@@ -26,7 +23,6 @@ from levelproof.pipeline.learn.folder import (
     keep_run,
     note_in,
     require_same_run,
-    shown,
     stacks_in,
     tell_done,
     with_stack,
@@ -70,16 +66,6 @@ def test_weights_that_are_not_finite_replace_nothing(tmp_path: Path) -> None:
         keep_run(tmp_path, diverged, STATE)
     for path in before.iterdir():
         assert (tmp_path / path.name).read_bytes() == path.read_bytes()
-
-
-def test_a_file_gets_kept_lines_and_one_every_half_minute(monkeypatch: pytest.MonkeyPatch) -> None:
-    now, text = [0.0], io.StringIO()
-    monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    with shown(Console(file=text), "compiling", 100, 0) as show:
-        for update in range(1, 101):
-            now[0] += 1.0
-            show(1, f"update {update}", keep=update == 40)
-    assert text.getvalue().splitlines() == ["update 30", "update 40", "update 70", "update 100"]
 
 
 def test_run_that_saved_nothing_gives_way_to_other_settings(tmp_path: Path) -> None:

@@ -1,16 +1,24 @@
-"""The progress bar of long reads, where there is no terminal."""
+"""Progress bars, and the lines in their place where there is no terminal."""
 
 import io
+from itertools import count
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
 from levelproof.pipeline.store import progress_bar
-from levelproof.pipeline.store.progress_bar import ProgressBar, shown_blocks
+from levelproof.pipeline.store.progress_bar import LINE_EVERY, ProgressBar, TextBar, shown_blocks
 
 
-def test_line_has_no_rate_before_one_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(progress_bar, "LINE_EVERY", 0.0)
+@pytest.fixture
+def slow(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let LINE_EVERY pass from one update to the next."""
+    monkeypatch.setattr(progress_bar, "time", SimpleNamespace(monotonic=count(0.0, LINE_EVERY).__next__))
+
+
+@pytest.mark.usefixtures("slow")
+def test_line_has_no_rate_before_one_is_known() -> None:
     text = io.StringIO()
     with ProgressBar("levels", 100, Console(file=text)) as bar:
         bar.advance(10)
@@ -21,8 +29,8 @@ def test_line_has_no_rate_before_one_is_known(monkeypatch: pytest.MonkeyPatch) -
     assert "/s · about " in second
 
 
-def test_blocks_are_counted_in_items_and_only_if_many(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(progress_bar, "LINE_EVERY", 0.0)
+@pytest.mark.usefixtures("slow")
+def test_blocks_are_counted_in_items_and_only_if_many() -> None:
     text = io.StringIO()
     assert [*shown_blocks(10, 4, "levels", Console(file=text))] == [0, 4, 8]
     assert [line.split(" · ")[0] for line in text.getvalue().splitlines()] == [f"{n}/10 levels" for n in (4, 8, 10)]
@@ -30,6 +38,16 @@ def test_blocks_are_counted_in_items_and_only_if_many(monkeypatch: pytest.Monkey
     assert [*shown_blocks(10, 4, "levels", Console(file=few), least=11)] == [0, 4, 8]
     assert [*shown_blocks(0, 4, "levels", Console(file=few))] == []
     assert not few.getvalue()
+
+
+def test_a_file_gets_kept_lines_and_one_every_half_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, text = [0.0], io.StringIO()
+    monkeypatch.setattr(progress_bar, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    with TextBar(Console(file=text), "compiling", 100) as bar:
+        for update in range(1, 101):
+            now[0] += 1.0
+            bar.show(update, f"update {update}", keep=update == 40)
+    assert text.getvalue().splitlines() == ["update 30", "update 40", "update 70", "update 100"]
 
 
 def test_bar_within_a_bar_is_not_drawn() -> None:
