@@ -21,17 +21,10 @@ from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.dataset.subsets import TRAIN, VALIDATION, in_subset
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.learn.curves import BLUE, GREEN, Curves, Panel
-from levelproof.pipeline.learn.folder import (
-    continued,
-    origin_of,
-    require_same_run,
-    settings_without,
-    tell_done,
-    writing_run,
-)
+from levelproof.pipeline.learn.folder import continued, origin_of, settings_without
 from levelproof.pipeline.learn.pace import Pace
 from levelproof.pipeline.learn.pool import Feed, PartedSplit, validation_batches
-from levelproof.pipeline.learn.run import Run, recorded
+from levelproof.pipeline.learn.run import Begun, Run, make_policy
 from levelproof.pipeline.learn.sealed import require_not_sealed, without_sealed
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.progress_bar import ProgressBar, TextBar, say
@@ -72,17 +65,14 @@ def clone(splits: Sequence[Path], config: CloneConfig, out: Path, console: Conso
         origin = origin_of(note, {"updates": int(state.updates)})
         return Policy(config.network, state.average, config.network.only_size(size), origin)
 
-    with writing_run(out) as require_ours:
-        require_same_run(out, note)
+    def begin() -> Begun[Imitation]:
         state = continued(out, begin_imitation(np.int32(config.seed), config.network, size, config.train))
-        curves = COURSE if config.played else COURSE._replace(panels=COURSE.panels[:-1])
         updates = int(state.updates)
-        trains = updates < config.train.updates
-        with recorded(out, note, curves, config.log, updates, policy_of, tell, require_ours, trains) as run:
-            if trains:
-                state = train(sources, config, state, run, console)
-            run.save(state)
-    tell_done(out, config.network.only_size(size), tell)
+        advance = lambda run: train(sources, config, state, run, console)
+        return Begun(state, updates, updates < config.train.updates, advance)
+
+    curves = COURSE if config.played else COURSE._replace(panels=COURSE.panels[:-1])
+    make_policy(out, note, curves, config.log, begin, policy_of, tell)
 
 
 def source_of(split: Path, config: CloneConfig, tell: Callable[[str], None]) -> PartedSplit:

@@ -24,21 +24,13 @@ from levelproof.levelgen.batching import take
 from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.learn.curves import BLUE, GREEN, YELLOW, Curves, Panel
-from levelproof.pipeline.learn.folder import (
-    continued,
-    origin_of,
-    require_same_run,
-    settings_without,
-    tell_done,
-    weights_digest,
-    writing_run,
-)
+from levelproof.pipeline.learn.folder import continued, origin_of, settings_without, weights_digest
 from levelproof.pipeline.learn.kept_experts import experts_of
 from levelproof.pipeline.learn.labelled import LabelBuffer, empty_labels
 from levelproof.pipeline.learn.pace import Pace
 from levelproof.pipeline.learn.pool import read_pool
 from levelproof.pipeline.learn.rounds import TaughtLevels, teach
-from levelproof.pipeline.learn.run import Run, recorded
+from levelproof.pipeline.learn.run import Begun, Run, make_policy
 from levelproof.pipeline.learn.sealed import require_not_sealed, require_some_usable, without_sealed
 from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.read.select import labelled
@@ -96,8 +88,7 @@ def distill(split: Path, config: DistillConfig, out: Path, console: Console) -> 
         origin = origin_of(note, {"updates": int(now.imitation.updates)}, start)
         return Policy(network, now.imitation.average, network.only_size(size), origin)
 
-    with writing_run(out) as require_ours:
-        require_same_run(out, note)
+    def begin() -> Begun[Distillation]:
         taught = witnessed(chosen, network, console)
         params = start.params if start else None
         columns = taught.witnesses.motion.shape[1]
@@ -108,11 +99,10 @@ def distill(split: Path, config: DistillConfig, out: Path, console: Console) -> 
         now = continued(out, fresh)
         now = now._replace(labels=jax.device_get(now.labels))
         updates = int(now.imitation.updates)
-        trains = updates < config.train.updates
-        with recorded(out, note, COURSE, config.log, updates, policy_of, tell, require_ours, trains) as run:
-            now = update_until_done(taught, config, network, now, run, console)
-            run.save(now)
-    tell_done(out, network.only_size(size), tell)
+        advance = lambda run: update_until_done(taught, config, network, now, run, console)
+        return Begun(now, updates, updates < config.train.updates, advance)
+
+    make_policy(out, note, COURSE, config.log, begin, policy_of, tell)
 
 
 def levels_for(split: Path, config: DistillConfig, tell: Callable[[str], None]) -> ChosenLevels:

@@ -23,18 +23,9 @@ from levelproof.levelgen.task.lanes import Table
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.learn.curves import BLUE, GREEN, Curves, Panel
-from levelproof.pipeline.learn.folder import (
-    continued,
-    note_in,
-    origin_of,
-    require_same_run,
-    settings_without,
-    tell_done,
-    weights_digest,
-    writing_run,
-)
+from levelproof.pipeline.learn.folder import continued, note_in, origin_of, settings_without, weights_digest
 from levelproof.pipeline.learn.pace import Pace
-from levelproof.pipeline.learn.run import Run, recorded
+from levelproof.pipeline.learn.run import Begun, Run, make_policy
 from levelproof.pipeline.learn.trained_on import TrainingLevels, levels_for
 from levelproof.pipeline.read.policies import policy_at, require_size
 from levelproof.pipeline.runtime import own_cores, prepare_jax
@@ -74,27 +65,25 @@ def train(config: TrainConfig, out: Path, console: Console) -> None:
         why = f"each of {many(cores, 'core')} learns from a whole number of chunks of {CHUNK} lanes"
         tell(f"The policy learns from {share:.1%} of samples, not {config.ppo.subsample:.1%}, because {why}.")
     note = note_of(config, source, cores)
-    params = None if start is None else start.params
 
     def policy_of(note: dict[str, Any], learner: Learner) -> Policy:
         origin = origin_of(note, {"env_steps": int(learner.updates) * config.ppo.steps_per_update}, start)
         return Policy(recipe.network, learner.average, recipe.network.only_size(source.levels.size), origin)
 
-    with writing_run(out) as require_ours:
-        require_same_run(out, note, LATER)
-        table = table_of(source.levels, recipe.rules)
+    def begin() -> Begun[Learner]:
+        table, params = table_of(source.levels, recipe.rules), start.params if start else None
         programs = programs_of(recipe, table, params, cores)
         fresh = programs.begin(table, params)
         table, params = jax.device_put((table, params), fresh.updates.sharding)  # once, not in every update
         learner = jax.tree.map(lambda x, like: jax.device_put(x, like.sharding), continued(out, fresh), fresh)
         updates = int(learner.updates)
-        steps, trains = updates * config.ppo.steps_per_update, updates < config.ppo.updates
+        steps = updates * config.ppo.steps_per_update
         if updates > config.ppo.updates:
             raise UserError(f"{out} has {steps:,} env steps of training already: set a larger ppo.env_steps.")
-        with recorded(out, note, COURSE, config.log, steps, policy_of, tell, require_ours, trains) as run:
-            learner = update_until_done(programs, learner, table, params, recipe, config.interval, run, console)
-            run.save(learner)
-    tell_done(out, recipe.network.only_size(source.levels.size), tell)
+        advance = lambda run: update_until_done(programs, learner, table, params, recipe, config.interval, run, console)
+        return Begun(learner, steps, updates < config.ppo.updates, advance)
+
+    make_policy(out, note, COURSE, config.log, begin, policy_of, tell, LATER)
 
 
 def prepared_cores(config: TrainConfig, note: dict[str, Any] | None) -> int:

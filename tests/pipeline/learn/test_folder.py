@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -149,15 +150,17 @@ def test_run_that_another_stack_began_continues_and_says_so(tmp_path: Path) -> N
 @pytest.mark.parametrize("trains", [False, True])
 def test_a_stack_is_noted_once_it_has_trained(trains: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     noted, told, before = list[Any](), list[str](), [{"jax": "0.9"}]
-    monkeypatch.setattr(writer, "keep_run", lambda out, policy, state: noted.append(policy))
+    monkeypatch.setattr(writer, "keep_run", lambda out, policy, state: noted.append(policy.made_by))
     (tmp_path / CHECKPOINT).touch()
     write_note(tmp_path, {"seed": 0, MADE_BY: before})
-    policy_of: Any = lambda note, state: note[MADE_BY]
-    log = "none" if trains else "a logger"
-    with writer.recorded(tmp_path, {"seed": 0}, COURSE, log, 0, policy_of, told.append, list, trains) as run:
+    policy_of: Any = lambda note, state: SimpleNamespace(size=None, made_by=note[MADE_BY])
+
+    def advance(run: writer.Run[None]) -> None:
         assert stacks_in(tmp_path) == before
-        if trains:
-            run.keep(None, {COURSE.step: 1, "bc/loss": 0.5}, "bc/loss", "train.learning_rate")
-        run.save(None)
+        run.keep(None, {COURSE.step: 1, "bc/loss": 0.5}, "bc/loss", "train.learning_rate")
+
+    begin = lambda: writer.Begun(None, 0, trains, advance)
+    log = "none" if trains else "a logger"
+    writer.make_policy(tmp_path, {"seed": 0}, COURSE, log, begin, policy_of, told.append)
     assert noted[-1] == stacks_in(tmp_path)
-    assert [len(told), len(noted[-1])] == ([1, 2] if trains else [0, 1])
+    assert [len(told), len(noted[-1])] == ([2, 2] if trains else [1, 1])
