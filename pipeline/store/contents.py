@@ -63,13 +63,12 @@ def size_of_levels(arrays: Mapping[str, np.ndarray]) -> Size:
 
 
 @cache
-def blank_row(size: Size, encoding: Encoding) -> np.ndarray:
+def blank_row(size: Size, table: tuple[FieldSpec, ...]) -> np.ndarray:
     """Return the empty level's row of FLAT: its fields, its state in every key frame, and zeros elsewhere.
 
     Rows are stored XORed with it; the result is mostly zero, because nearly all levels share the scenery.
     """
     empty, arrays = arrays_of(empty_level(size, 1), "level/"), {}
-    table = table_for(size, encoding)
     for field in table:
         start = empty.get(field.name.replace(KEY, "level/", 1), np.zeros((*field.shape, 1), field.dtype))
         arrays[field.name] = start if field.constant else np.repeat(start[None], field.steps, 0)

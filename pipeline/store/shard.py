@@ -82,7 +82,7 @@ def write_shard(
         group = zarr.create_group(path, attributes=attributes)
         for name, values in pack(stored, table).items():
             if name == FLAT:
-                values ^= blank_row(size_of_levels(stored), encoding)
+                values ^= blank_row(size_of_levels(stored), tuple(table))
             blosc = BloscCodec(cname="zstd", typesize=values.dtype.itemsize, **COMPRESSION.get(name, COMPRESSION[None]))
             group.create_array(
                 name,
@@ -278,7 +278,7 @@ def _read_alike(parts: Sequence[Part], table: Sequence[FieldSpec], places: Seque
 
     at_once(parts[0][0].path, put, parts, places)
     if FLAT in packed:
-        packed[FLAT] ^= blank_row(size, encoding)
+        packed[FLAT] ^= blank_row(size, known)
     try:
         stored = _named(packed, chosen, size)
     except ValueError:  # find the shard with invalid values

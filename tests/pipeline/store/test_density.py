@@ -79,7 +79,7 @@ def changed(shard: Shard, change: Callable[[dict[str, np.ndarray]], None]) -> Sh
     table = table_for(shard.size, shard.encoding)
     group = zarr.open_group(shard.path, mode="r+")
     packed = {name: np.asarray(group[name][:]) for name in shard.arrays}  # type: ignore[index]
-    mask = {"witness": blank_row(shard.size, shard.encoding)} if "witness" in packed else {}
+    mask = {"witness": blank_row(shard.size, table)} if "witness" in packed else {}
     packed |= {name: packed[name] ^ mask[name] for name in mask}
     stored = {name: np.moveaxis(x, 0, -1).copy() for name, x in unpack(packed, table).items()}
     change(stored)
