@@ -98,11 +98,10 @@ def with_stack(note: dict[str, Any], tell: Callable[[str], None]) -> dict[str, A
     Tells the user if other versions or another device trained the run last: its bytes may then differ.
     """
     before, now = note[MADE_BY], versions() | learned_with() | {"device": device()}
-    if before and before[-1] != now:
-        others = ", ".join(f"{name} {value}" for name, value in before[-1].items() if now.get(name) != value)
-        differs = "so its policy may differ from that of an uninterrupted run"
-        tell(f"This run was last trained with {others}, {differs}.")
-    return note | {MADE_BY: before if before[-1:] == [now] else [*before, now]}
+    last = before[-1] if before else {}
+    if others := ", ".join(f"{name} {value}" for name, value in last.items() if now.get(name) != value):
+        tell(f"This run was last trained with {others}, so its policy may differ from that of an uninterrupted run.")
+    return note | {MADE_BY: before if last == now else [*before, now]}
 
 
 def _without(note: Any, path: Sequence[str]) -> Any:
