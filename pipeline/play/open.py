@@ -14,7 +14,7 @@ from levelproof.experts.procedure import Procedure
 from levelproof.experts.witness.witness import steps_to_goal
 from levelproof.levelgen.files.level_file import LevelFile
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.look.gallery.attempts import Contender
+from levelproof.pipeline.look.gallery.contender import Contender
 from levelproof.pipeline.play.server import HOST, serving
 from levelproof.pipeline.play.session import empty_file, require_playable, witness_in
 from levelproof.pipeline.read.levels import find_level, is_level_file, level_file, levels_of, rules_of

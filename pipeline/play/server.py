@@ -22,7 +22,7 @@ from levelproof.experts.procedure import Procedure
 from levelproof.levelgen.files.level_file import LevelFile
 from levelproof.levelgen.pictures.palette import palette_css
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.look.gallery.attempts import Contender
+from levelproof.pipeline.look.gallery.contender import Contender
 from levelproof.pipeline.look.gallery.gallery import SITE
 from levelproof.pipeline.play.session import Message, Session
 from levelproof.pipeline.play.training import train_level

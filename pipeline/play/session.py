@@ -21,7 +21,7 @@ from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import CHOICES, controls
 from levelproof.levelgen.task.rules import TaskParams, TaskState
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.look.gallery.attempts import Contender
+from levelproof.pipeline.look.gallery.contender import Contender
 from levelproof.pipeline.look.gallery.worlds import drawn_bodies, world_of
 from levelproof.pipeline.look.show import MAX_FRAME_SKIP
 from levelproof.pipeline.version import __version__

@@ -24,7 +24,7 @@ from levelproof.levelgen.pictures.palette import palette_css
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.look import cost
 from levelproof.pipeline.look.entities import ENTITIES, count_entities
-from levelproof.pipeline.look.gallery.attempts import FAILS, SOLVES, Contender, PolicyAttempt
+from levelproof.pipeline.look.gallery.contender import FAILS, SOLVES, Contender, PolicyAttempt
 from levelproof.pipeline.look.gallery.pages import PAGE, encode_columns, encode_page
 from levelproof.pipeline.look.gallery.worlds import drawn_bodies, encode_array, states_of, world_of
 from levelproof.pipeline.look.spread import spread

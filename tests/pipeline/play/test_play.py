@@ -24,7 +24,7 @@ from levelproof.experts.witness.witness import replay, succeeds
 from levelproof.levelgen.files.level_file import from_document, to_document, write_level_file
 from levelproof.levelgen.level import SIZES
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.look.gallery.attempts import Contender
+from levelproof.pipeline.look.gallery.contender import Contender
 from levelproof.pipeline.play import training
 from levelproof.pipeline.play.open import level_to_play
 from levelproof.pipeline.play.server import HOST, serving

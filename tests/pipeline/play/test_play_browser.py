@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from levelproof.levelgen.files.level_file import from_document
-from levelproof.pipeline.look.gallery.attempts import Contender
+from levelproof.pipeline.look.gallery.contender import Contender
 from levelproof.pipeline.play.server import HOST, serving
 from levelproof.pipeline.play.session import Session, empty_file
 from tests.pace import patience

@@ -1,4 +1,4 @@
-"""A policy's attempts at levels, for pages that play them."""
+"""A policy that plays levels on pages that show its attempts."""
 
 from typing import NamedTuple
 
