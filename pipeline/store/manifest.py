@@ -32,7 +32,7 @@ from levelproof.pipeline.store.fragment import FULL, Fragment, read_fragment
 from levelproof.pipeline.store.layout import FRAGMENT, JOB, MANIFEST, Attempt, entries, ids_of
 from levelproof.pipeline.store.progress_bar import ProgressBar
 from levelproof.pipeline.store.remote import INDEX, is_listed, is_remote, stale_index
-from levelproof.pipeline.store.runs import ascending
+from levelproof.pipeline.store.runs import ascending, within
 from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.store.seed.rows import seed_parts
 from levelproof.pipeline.urls import quoted, require_known
@@ -133,12 +133,6 @@ def index_of(split: Path) -> bytes:
 def write_index(split: Path) -> None:
     """Write that file durably. Raises: as `files.write`."""
     files.write(split / MANIFEST / INDEX, index_of(split), durable=True)
-
-
-def any_within(ordered: np.ndarray, first: int, last: int) -> bool:
-    """Return whether any of these ascending ids is from `first` to `last`."""
-    low, high = np.searchsorted(ordered, [first, last + 1])
-    return bool(low < high)
 
 
 @dataclass(frozen=True)
@@ -278,13 +272,15 @@ def _parts(
 
 
 def _wanted(path: Path, level_ids: np.ndarray | None) -> bool:
-    return level_ids is None or any_within(level_ids, *ids_of(path))
+    return level_ids is None or len(within(level_ids, *ids_of(path))) > 0
 
 
 def _part(
     path: Path, names: Sequence[str], level_ids: np.ndarray | None, compact: bool, each: Each | None
 ) -> tuple[Fragment, pa.Table] | None:
-    """Read a fragment and its rows; None: it is missing."""
+    """Read a fragment and its rows, of these levels (ascending ids; None: of all); None: it is missing."""
+    if level_ids is not None:
+        level_ids = within(level_ids, *ids_of(path))  # comparing a fragment's ids with millions takes seconds
     try:
         fragment, table = read_fragment(path, names, level_ids, compact)
     except FileNotFoundError:

@@ -13,6 +13,12 @@ def ascending(numbers: np.ndarray) -> np.ndarray:
     return ordered[np.diff(ordered, prepend=ordered[:1] - 1) != 0]
 
 
+def within(ordered: np.ndarray, first: int, last: int) -> np.ndarray:
+    """Return those of these ascending ids that are from `first` to `last`."""
+    low, high = np.searchsorted(ordered, [first, last + 1])
+    return ordered[low:high]
+
+
 def runs(numbers: Sequence[int] | np.ndarray) -> list[tuple[int, int]]:
     """Return first and last of each run of consecutive numbers, ascending."""
     if isinstance(numbers, range) and numbers.step == 1:  # needs no memory, whatever its length
@@ -35,7 +41,7 @@ def without(runs: Iterable[Sequence[int]], level_ids: np.ndarray) -> list[tuple[
     """Remove ids (ascending) from runs; return the remaining runs."""
     left = []
     for first, last in runs:
-        removed = level_ids[np.searchsorted(level_ids, first) : np.searchsorted(level_ids, last, "right")]
+        removed = within(level_ids, first, last)
         starts, ends = np.r_[first, removed + 1], np.r_[removed - 1, last]
         some = starts <= ends
         left += zip(starts[some].tolist(), ends[some].tolist(), strict=True)

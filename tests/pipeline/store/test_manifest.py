@@ -3,8 +3,8 @@
 import io
 import itertools
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -16,7 +16,7 @@ from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs.unit import manifest_row
 from levelproof.pipeline.store import manifest as manifest_file
 from levelproof.pipeline.store.columns import COLUMNS, MANIFEST_VERSION
-from levelproof.pipeline.store.layout import new_attempt, unit_name
+from levelproof.pipeline.store.layout import ids_of, new_attempt, unit_name
 from levelproof.pipeline.store.manifest import (
     begin_fragment,
     changes_text,
@@ -193,9 +193,11 @@ def test_read_manifest_opens_only_fragments_that_cover_the_levels(
     paths = {tuple(ids): commit(tmp_path, job, list(ids)) for ids in ((0, 1, 2), (2, 5), (6, 7), (9, 20), (30,))}
     opened: list[Path] = []
 
-    def noted(path: Path, columns: list[str], *how: Any) -> object:
+    def noted(path: Path, columns: list[str], level_ids: np.ndarray, compact: bool) -> object:
         opened.append(path)
-        return read_fragment(path, columns, *how)
+        first, last = ids_of(path)
+        assert all((first <= level_ids) & (level_ids <= last))  # the others would slow down each fragment
+        return read_fragment(path, columns, level_ids, compact)
 
     monkeypatch.setattr(manifest_file, "read_fragment", noted)
     for level_ids, rows, units in (
