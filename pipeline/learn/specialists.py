@@ -45,25 +45,24 @@ def specialists_of(split: Path, levels: MeasuredLevels, attempts: int) -> Specia
         None if the split's levels are of another size.
 
     Raises:
-        UserError: there is no such split, it lacks a level or has another one of its id, or none of its solved levels
+        UserError: there is no such split, it lacks a level or has another one of its id, or no solved one of them
             has a rate.
         Failure: the split is damaged.
     """
-    manifest = require_manifest(split, ["level_id", "label", "success_rate", "budget", "size"])
-    table, config = manifest.table, manifest.config or {}
-    if table.num_rows and table["size"][0].as_py() != name_of(levels.levels.size):
-        return None
     level_ids = levels.level_ids
-    row_of = {level_id: row for row, level_id in enumerate(table["level_id"].to_pylist())}
-    missing = [level_id for level_id in level_ids.tolist() if level_id not in row_of]
-    if missing:
+    manifest = require_manifest(split, ["label", "success_rate", "budget"], level_ids)
+    config = manifest.config or require_manifest(split, []).config or {}  # no fragment was read: none has such ids
+    if config.get("size") != name_of(levels.levels.size):
+        return None
+    missing = np.setdiff1d(level_ids, manifest.level_ids)
+    if len(missing):
         raise UserError(
             f"{split} lacks {len(missing):,} of the levels, such as {missing[0]}: label them there first, or name "
             "another split with --experts."
         )
     _require_same_levels(split, levels, config)
-    rows = table.take([row_of[level_id] for level_id in level_ids.tolist()])
-    rates = table.filter(pc.field("label") == Label.SOLVED)["success_rate"]
+    rows = manifest.table.take(np.searchsorted(manifest.level_ids, level_ids))
+    rates = rows.filter(pc.field("label") == Label.SOLVED)["success_rate"]
     if len(rates) and rates.null_count == len(rates):
         raise UserError(
             f"{split} has no success rates, because procedure=label does not measure them: name a split made with "
