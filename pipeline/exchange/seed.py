@@ -30,7 +30,7 @@ from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 from levelproof.pipeline.store.origins import RECORD
 from levelproof.pipeline.store.progress_bar import ProgressBar
-from levelproof.pipeline.store.seed.columns import KEPT, ROW_GROUP, SCHEMA
+from levelproof.pipeline.store.seed.columns import KEPT, ROW_GROUP, SCHEMA, SEEDS
 from levelproof.pipeline.store.seed.file import SUFFIX
 from levelproof.pipeline.store.seed.packed import pack_witness
 from levelproof.pipeline.store.seed.rows import reason_of
@@ -57,8 +57,8 @@ def export_seed(split: Path, where: str | None, out: Path, with_levels: bool = T
         with_levels: whether levels that come from files are written; if not, `levels_elsewhere.add_levels` adds them.
 
     Raises:
-        UserError: the split does not exist, the condition is invalid, no level meets it, `out` exists or is not
-            named as seed files are or cannot be written, its settings are such that this program could not read the
+        UserError: the split does not exist, the condition is invalid, no level or too many meet it, `out` exists or is
+            not named as seed files are or cannot be written, its settings are such that this program could not read the
             file, or levels that come from ids or records should be left out.
         Failure: the split is damaged.
     """
@@ -66,6 +66,11 @@ def export_seed(split: Path, where: str | None, out: Path, with_levels: bool = T
     prepare_jax()  # hashes are computed as conditions ask for them
     manifest = require_manifest(split, [*READ, *columns_in(where)], compact=True)
     rows = select_some(split, manifest.table, where)
+    if rows.num_rows > SEEDS.max_rows:
+        raise UserError(
+            f"A seed file has at most {SEEDS.max_rows:,} levels, not {rows.num_rows:,}: write several files to "
+            "one folder, which is read as one, with `levelproof export --format seed --where` and ranges of level_id."
+        )
     if not with_levels:
         if not from_files(manifest.config or {}):
             raise UserError(f"The levels of {as_typed(split)} are sampled from their ids: leave out --without-levels.")

@@ -32,7 +32,7 @@ from levelproof.pipeline.store.contents import table_for
 from levelproof.pipeline.store.fields import arrays_of
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.seed import file
-from levelproof.pipeline.store.seed.columns import SCHEMA, WRITTEN
+from levelproof.pipeline.store.seed.columns import SCHEMA, SEEDS, WRITTEN
 from levelproof.pipeline.store.seed.packed import MAX_RUN, pack_witness, unpack_witnesses
 from levelproof.pipeline.store.seed.shard import SeedShard, play_seeds
 from levelproof.pipeline.store.seed.worlds import pack_worlds, unpack_worlds
@@ -380,6 +380,14 @@ def test_export_refuses_a_row_that_its_episode_belies(split: Path, tmp_path: Pat
     with pytest.raises(Failure, match=sentence):
         export_seed(forged, None, out)
     assert not out.exists()
+
+
+def test_export_refuses_more_levels_than_a_seed_file_may_have(
+    split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("levelproof.pipeline.exchange.seed.SEEDS", replace(SEEDS, max_rows=3))
+    with pytest.raises(UserError, match=r"at most 3 levels, not \d+: write several files to one folder"):
+        export_seed(split, None, tmp_path / "all.parquet")
 
 
 def test_condition_that_leaves_out_levels_that_differ_is_shown_whole(tmp_path: Path) -> None:
