@@ -46,7 +46,9 @@ from levelproof.pipeline.store.named import open_shard
 from levelproof.pipeline.words import many
 
 EPISODES_AT_ONCE = 1024  # read together for batches of episodes, so that many lanes are busy
-OPEN_SHARDS = 256  # shards whose indices are cached
+# Shards whose ids and indices are cached. These take 9 kB a shard and 24 to 88 bytes a level, less than the level's
+# manifest row; no file stays open. Opening a shard of 100,000 levels again takes a tenth of a second
+OPEN_SHARDS = 4096
 ALWAYS_FIELDS = ("record/action", "record/reward", "record/done", "record/goal")
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Int
 
 from levelproof.experts.config import RECORD_STEPS
 from levelproof.experts.witness.witness import Record
@@ -96,11 +97,13 @@ def _table_json(size: Size, encoding: Encoding) -> list[dict[str, Any]]:
     return [field.as_json() for field in table_for(size, encoding)]
 
 
-def check_level_ids(level_ids: Any) -> None:
-    """Raise ContentsError unless these are ascending ids of one or more levels."""
-    good = isinstance(level_ids, list) and len(level_ids) > 0 and all(type(x) is int for x in level_ids)
-    if not good or level_ids[0] < 0 or level_ids[-1] > MAX_LEVEL_ID or level_ids != sorted(set(level_ids)):
+def level_ids_in(level_ids: Any) -> Int[np.ndarray, " level"]:
+    """Return the level ids in a shard's attributes; raise ContentsError unless they are ascending, and one or more."""
+    good = isinstance(level_ids, list) and {*map(type, level_ids)} == {int}
+    ids = np.array(level_ids if good else [], np.int64)
+    if not len(ids) or ids[0] < 0 or ids[-1] > MAX_LEVEL_ID or (np.diff(ids) <= 0).any():
         raise ContentsError("its level ids are not ascending ids of levels")
+    return ids
 
 
 def check_numbers(arrays: Mapping[str, np.ndarray], size: Size) -> None:

@@ -32,7 +32,7 @@ class Place(NamedTuple):
 
 
 class _Source(NamedTuple):
-    level_ids: list[int]
+    level_ids: np.ndarray
     arrays: dict[str, Chunks]
 
 
@@ -54,7 +54,8 @@ def merge_shards(
     """
     documents, sources = _opened(dict.fromkeys(place.shard for place in places), moved)
     for shard, row, level_id in places:
-        if sources[shard].level_ids[row : row + 1] != [level_id]:
+        ids = sources[shard].level_ids
+        if not 0 <= row < len(ids) or ids[row] != level_id:
             raise damaged(shard, ContentsError(f"its row {row} is not level {level_id}, which the manifest names"))
     if rows_a_file is None:
         rows_a_file = _rows_a_file(sources)

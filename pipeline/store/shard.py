@@ -27,8 +27,8 @@ from levelproof.pipeline.store.contents import (
     FULL,
     ContentsError,
     blank_row,
-    check_level_ids,
     check_numbers,
+    level_ids_in,
     size_in,
     size_of_levels,
     table_for,
@@ -138,8 +138,7 @@ class Shard:
             if size not in (None, name_of(self.size)):
                 raise ContentsError(f"its levels have size {name_of(self.size)}, but the manifest says {size}")
             self.arrays = tuple(dict.fromkeys(field.array for field in table_for(self.size, self.encoding)))
-            check_level_ids(attributes["level_ids"])
-            self.level_ids: list[int] = attributes["level_ids"]
+            self.level_ids = level_ids_in(attributes["level_ids"])
             self._chunks: dict[str, Chunks] = {}
         except DAMAGE as error:
             raise damaged(path, error) from error

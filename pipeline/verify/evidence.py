@@ -127,7 +127,7 @@ class Evidence:
         for name, row in zip(names, rows, strict=True):
             shard = self.shards.get(name)
             ids = shard.level_ids if shard else []
-            holds.append(ids[row] if row is not None and 0 <= row < len(ids) else None)
+            holds.append(int(ids[row]) if row is not None and 0 <= row < len(ids) else None)
         # Levels of unusable shards were reported when these were opened
         self.reported |= [name is not None and self.shards[name] is None for name in names]
         right = np.array(holds, object) == self.ids

@@ -389,5 +389,5 @@ def _ids_in(data: Sequence[Path]) -> set[int]:
     ids = {level_id for path in data for level_id in unit_ids(path)}
     for path in data:
         with suppress(Failure):
-            ids |= set(Shard(path).level_ids)
+            ids |= set(Shard(path).level_ids.tolist())
     return ids

@@ -90,7 +90,7 @@ def test_commit_writes_every_field_of_solved_levels_to_the_shard(tmp_path: Path,
     commit(job, tmp_path, WorkUnit((4, 5, 7)), result)
     (name,) = read_manifest(tmp_path).shards
     shard = Shard(tmp_path / name)
-    assert shard.level_ids == [5, 7]
+    assert shard.level_ids.tolist() == [5, 7]
     stored = shard.read()
     for tree, kind, path in ((result.levels, Level, "level/"), (result.record, Record, "record/")):
         back = arrays_of(tree_of(kind, stored, path))
