@@ -374,7 +374,7 @@ class Dataset:
     def _subset(self, subset: str | None) -> Int[np.ndarray, " index"]:
         if subset is None:
             return np.arange(len(self))
-        indices = np.flatnonzero(in_subset(self.content_hashes, subset, self._validation))
+        indices = np.flatnonzero(in_subset(self._trajectories.hashes, subset, self._validation))
         if not len(indices):
             raise UserError(
                 f"None of the {len(self)} trajectories is in the subset {subset}: pass another validation= to open."

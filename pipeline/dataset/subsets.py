@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
 from jaxtyping import Bool
 
 from levelproof.pipeline.errors import Failure, UserError
@@ -17,7 +19,9 @@ def check_share(share: float) -> None:
         raise UserError(f"The share of validation is {share}: use a number from 0 to 1.")
 
 
-def in_subset(content_hashes: Sequence[str], subset: str | None, share: float) -> Bool[np.ndarray, " level"]:
+def in_subset(
+    content_hashes: Sequence[str] | pa.ChunkedArray, subset: str | None, share: float
+) -> Bool[np.ndarray, " level"]:
     """Return which levels are in a subset (None: all); `share` of all hashes belong to validation.
 
     Depends only on the level's hash and the share. A larger share keeps all levels that are already in validation.
@@ -30,8 +34,13 @@ def in_subset(content_hashes: Sequence[str], subset: str | None, share: float) -
         return np.ones(len(content_hashes), bool)
     if subset not in SUBSETS:
         raise UserError(f"There is no subset {subset!r}: choose {' or '.join(SUBSETS)}, or None for both.")
+    # In Arrow, because millions of Python strings take gigabytes
+    in_arrow = isinstance(content_hashes, pa.ChunkedArray)
+    hashes = content_hashes if in_arrow else pa.chunked_array([content_hashes], pa.string())
+    ends = pc.call_function("utf8_slice_codeunits", [hashes], pc.SliceOptions(-DIGITS)).combine_chunks()
+    digits = pc.call_function("binary_join", [pa.ListArray.from_arrays([0, len(ends)], ends), ""])[0].as_py()
     try:
-        drawn = np.frombuffer(bytes.fromhex("".join(content_hash[-DIGITS:] for content_hash in content_hashes)), ">u4")
+        drawn = np.frombuffer(bytes.fromhex(digits), ">u4")
     except ValueError:
         drawn = np.zeros(0, ">u4")
     if len(drawn) != len(content_hashes):

@@ -90,10 +90,11 @@ class TrajectoryRows:
     @property
     def content_hashes(self) -> list[str]:
         """Content hashes of the levels; of seeds, made from the levels once on a machine."""
-        return self._hashes.to_pylist()
+        return self.hashes.to_pylist()
 
     @cached_property
-    def _hashes(self) -> pa.ChunkedArray:
+    def hashes(self) -> pa.ChunkedArray:
+        """Content hashes as a column of Arrow, of which millions take little memory."""
         if "content_hash" in self.table.column_names:
             return self.table["content_hash"]
         kind = f"content hashes of versions {SAMPLER_VERSION} and {VERSION}"

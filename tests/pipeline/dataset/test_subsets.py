@@ -3,6 +3,7 @@
 import hashlib
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
 from levelproof.pipeline.dataset.subsets import check_share, in_subset
@@ -24,6 +25,12 @@ def test_in_subset_is_the_same_in_every_version() -> None:
     """Else levels that one version validates on were trained on by another."""
     first = np.flatnonzero(in_subset(HASHES, "validation", 0.1))[:12]
     assert first.tolist() == [6, 7, 32, 46, 48, 60, 65, 74, 75, 84, 121, 122]
+
+
+def test_in_subset_takes_columns_of_arrow() -> None:
+    column = pa.chunked_array([HASHES[:7], HASHES[7:]])
+    expected = [int(content_hash[-8:], 16) < 0.1 * 2**32 for content_hash in HASHES]
+    assert in_subset(column, "validation", 0.1).tolist() == expected
 
 
 def test_in_subset_keeps_validation_levels_when_the_share_grows() -> None:
