@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from io import BytesIO
 from pathlib import Path
 
-from levelproof.pipeline.store.remote import at_once, bytes_of, is_listed, is_remote, stored_in
+from levelproof.pipeline.store.remote import at_once, bytes_of, is_listed, is_remote, stored_at, stored_in
 
 MARK = b"levelproof.sha256:"  # before a fragment's own digest
 OWN = len(MARK) + hashlib.sha256().digest_size
@@ -66,6 +66,8 @@ def altered(path: Path, digests: Mapping[str, str], name: str) -> list[str]:
         OSError: a file cannot be read.
     """
     files = [file for file in digests if file.rpartition("/")[2] == name and _is_below(file)]
+    if files and is_remote(path):
+        stored_at(path / files[0])  # lists the shard once, not once per thread
     actual = at_once(path, lambda file: _digest(path / file), files)
     return [file for file, digest in zip(files, actual, strict=True) if digest != digests[file]]
 

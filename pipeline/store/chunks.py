@@ -79,6 +79,12 @@ class Chunks:
                     self._checked(chunk)
                     yield chunk
 
+    def fetch(self, row: int) -> None:
+        """Have the file of this row in the cache, if it is remote. Raises as `RemoteFile.fetch`."""
+        if is_remote(self.shard):
+            file = RemoteFile(self.shard / file_name(self.name, row // self.rows_a_file, len(self.shape)))
+            file.fetch([(0, file.size)])
+
     def _opened(self, number: int) -> "LocalFile | RemoteFile":
         name = file_name(self.name, number, len(self.shape))
         if is_remote(self.shard):

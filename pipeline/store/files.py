@@ -4,11 +4,12 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import chain
 from pathlib import Path
 
 from levelproof.pipeline.store import objects
 from levelproof.pipeline.store.disk import flush_entry, write_new
-from levelproof.pipeline.store.remote import is_remote, stored_in
+from levelproof.pipeline.store.remote import at_once, is_remote, stored_in
 
 
 def write(path: Path, data: bytes, mode: int = 0o666, durable: bool = False) -> None:
@@ -68,15 +69,18 @@ def remove(*paths: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def remove_data(path: Path) -> None:
-    """Remove a shard or experts as far as possible: on NFS, open files stay until the next run tries again.
+def remove_data(*paths: Path) -> None:
+    """Remove shards or experts as far as possible: on NFS, open files stay until the next run tries again.
 
     Raises:
         UserError, StoreFailure: the store's request fails.
     """
-    if is_remote(path):
-        objects.remove(stored_in(path) if path.suffix == ".zarr" else [path])
-    elif path.is_dir():
-        shutil.rmtree(path, ignore_errors=True)
-    else:
-        path.unlink(missing_ok=True)
+    if paths and is_remote(paths[0]):
+        files = at_once(paths[0], lambda path: stored_in(path) if path.suffix == ".zarr" else [path], paths)
+        objects.remove(chain(*files))
+        return
+    for path in paths:
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)

@@ -24,7 +24,7 @@ from levelproof.pipeline.store.locks import without_commits
 from levelproof.pipeline.store.manifest import DATA_COLUMNS, Manifest, data_named_by, read_fragment, read_manifest
 from levelproof.pipeline.store.objects import put
 from levelproof.pipeline.store.publish import OVER, ended
-from levelproof.pipeline.store.remote import as_typed, is_remote
+from levelproof.pipeline.store.remote import as_typed, at_once, is_remote
 
 
 def clean(split: Path, say: Callable[[str], None]) -> Manifest:
@@ -42,22 +42,20 @@ def clean(split: Path, say: Callable[[str], None]) -> Manifest:
         begun = entries(split, MANIFEST, BEGUN, DirEntry.is_file)
         manifest = read_manifest(split, ["label", *DATA_COLUMNS], compact=True)
         named = manifest.shards | manifest.named["experts"]
-        for fragment in manifest.superseded:
-            theirs = data_named_by(read_fragment(fragment.path, DATA_COLUMNS)[1])
-            disown(data_path(split, name) for name in theirs - named)
-            remove(fragment.path)
+        superseded = [fragment.path for fragment in manifest.superseded]
+        theirs = at_once(split, lambda path: data_named_by(read_fragment(path, DATA_COLUMNS)[1]), superseded)
+        disown(data_path(split, name) for name in frozenset().union(*theirs) - named)
+        remove(*superseded)
         unnamed = [path for path in data_paths(split) if path.relative_to(split).as_posix() not in named]
         over = begun.keys()
         if is_remote(split):
             over = ended(split, begun, named)
         dead = [path for path in unnamed if begun_path(path) in over]
-        for path in dead:
-            remove_data(path)
+        remove_data(*dead)
         stuck = {begun_path(path) for path in dead if path.exists()}
         kinds = ("", JOB_BEGUN), (MANIFEST, INDEX_BEGUN), (QUARANTINE, NOTE_BEGUN)
         half = (entries(split, *kind, DirEntry.is_file) for kind in kinds)
-        for path in [*(over - stuck), *chain(*half)]:
-            remove(path)
+        remove(*(over - stuck), *chain(*half))
     if kept := sorted(path for path in set(unnamed) - set(dead) if begun_path(path) not in begun):
         more = f" and {len(kept) - 1} more like it" if kept[1:] else ""
         data = f"{as_typed(kept[0])}{more}"
@@ -73,14 +71,16 @@ def disown(data: Iterable[Path]) -> None:
         OSError: the write fails.
     """
     marks = [begun_path(path) for path in data]
+    if marks and is_remote(marks[0]):
+        at_once(marks[0], lambda mark: put(mark, OVER), marks)
+        return
     for mark in marks:
-        put(mark, OVER) if is_remote(mark) else os.close(regular(mark, os.O_WRONLY | os.O_CREAT))
-    for folder in {mark.parent for mark in marks if not is_remote(mark)}:
+        os.close(regular(mark, os.O_WRONLY | os.O_CREAT))
+    for folder in {mark.parent for mark in marks}:
         flush_entry(folder)
 
 
-def drop(shard: Path) -> None:
-    """Remove a shard that `disown` marked. `clean` removes later what cannot be removed now."""
-    remove_data(shard)
-    if not shard.exists():
-        remove(begun_path(shard))
+def drop(*shards: Path) -> None:
+    """Remove shards that `disown` marked. `clean` removes later what cannot be removed now."""
+    remove_data(*shards)
+    remove(*(begun_path(shard) for shard in shards if not shard.exists()))

@@ -17,7 +17,8 @@ from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.chunks import CHECKSUM, Chunks, file_name, read_whole
 from levelproof.pipeline.store.contents import ContentsError
 from levelproof.pipeline.store.disk import flush
-from levelproof.pipeline.store.shard import DAMAGE, Shard, damaged, stored_bytes
+from levelproof.pipeline.store.remote import at_once, in_order
+from levelproof.pipeline.store.shard import Shard, damaged, reading, stored_bytes
 
 FILE_BYTES = 64 * 2**20  # minimum bytes per file, if there is enough data; larger files have longer indices to read
 MISSING = 2**64 - 1  # offset and length of a missing chunk in an index
@@ -85,41 +86,52 @@ def _opened(paths: Iterable[Path], moved: Callable[[int], None]) -> tuple[dict[s
 
     Entries that depend on the number of levels are zeroed.
     """
-    first, shared, sources = None, {}, {}
-    for path in paths:
+    paths, shared, sources = [*paths], {}, {}
+
+    def opened(path: Path) -> tuple[dict[str, Any], _Source]:
         moved(0)
-        shard, arrays = Shard(path), {}
-        try:
-            files = {"": "zarr.json"} | {name: f"{name}/zarr.json" for name in shard.arrays}
-            documents = {name: json.loads(read_whole(path, file)) for name, file in files.items()}
-            for name in shard.arrays:
-                array = documents[name]
-                arrays[name] = Chunks(path, name, tuple(array["shape"]), np.dtype(array["data_type"]))
-                array["shape"][0] = array["chunk_grid"]["configuration"]["chunk_shape"][0] = 0
-            documents[""]["attributes"]["level_ids"] = []
-        except DAMAGE as error:
-            raise damaged(path, error) from error
-        if first is None:
-            first, shared = path, documents
-        elif documents != shared:
-            raise Failure(f"The shards {first} and {path} have different fields, so they cannot be merged.")
-        sources[path] = _Source(shard.level_ids, arrays)
+        return _open(path)
+
+    for path, (documents, source) in zip(paths, in_order(paths[0], opened, paths), strict=True):
+        shared = shared or documents
+        if documents != shared:
+            raise Failure(f"The shards {paths[0]} and {path} have different fields, so they cannot be merged.")
+        sources[path] = source
     return shared, sources
 
 
+def _open(path: Path) -> tuple[dict[str, Any], _Source]:
+    shard, arrays = Shard(path), {}
+    with reading(path):
+        files = {"": "zarr.json"} | {name: f"{name}/zarr.json" for name in shard.arrays}
+        documents = {name: json.loads(read_whole(path, file)) for name, file in files.items()}
+        for name in shard.arrays:
+            array = documents[name]
+            arrays[name] = Chunks(path, name, tuple(array["shape"]), np.dtype(array["data_type"]))
+            array["shape"][0] = array["chunk_grid"]["configuration"]["chunk_shape"][0] = 0
+        documents[""]["attributes"]["level_ids"] = []
+    return documents, _Source(shard.level_ids, arrays)
+
+
 def _rows_a_file(sources: dict[Path, _Source]) -> int:
-    stored = sum(stored_bytes(path) for path in sources)
+    stored = sum(at_once(next(iter(sources)), stored_bytes, sources))
     rows = sum(len(source.level_ids) for source in sources.values())
     return 1 << max(0, int(np.ceil(np.log2(FILE_BYTES * rows / max(stored, 1)))))
 
 
 def _chunks(name: str, places: Sequence[Place], sources: dict[Path, _Source]) -> Iterator[bytes]:
     """Yield the encoded chunks of an array."""
-    for path, group in groupby(places, lambda place: place.shard):
-        try:
-            yield from sources[path].arrays[name].encoded(place.row for place in group)
-        except DAMAGE as error:
-            raise damaged(path, error) from error
+    groups = [(path, [place.row for place in group]) for path, group in groupby(places, lambda place: place.shard)]
+
+    def fetched(group: tuple[Path, list[int]]) -> tuple[Path, list[int]]:
+        path, rows = group
+        with reading(path):
+            sources[path].arrays[name].fetch(rows[0])
+        return group
+
+    for path, rows in in_order(places[0].shard, fetched, groups):
+        with reading(path):
+            yield from sources[path].arrays[name].encoded(rows)
 
 
 def _write_file(path: Path, chunks: Iterable[bytes], room: int, moved: Callable[[int], None]) -> None:

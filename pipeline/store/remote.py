@@ -106,6 +106,13 @@ def at_once(path: Path, work: Callable[..., T], *items: Iterable[Any]) -> list[T
     return results
 
 
+def in_order(path: Path, work: Callable[[Any], T], items: Sequence[Any]) -> Iterator[T]:
+    """Map `work` over items, one after another; if the path is remote, over REQUESTS at once, and no further ahead."""
+    step = REQUESTS if is_remote(path) else 1
+    for first in range(0, len(items), step):
+        yield from at_once(path, work, items[first : first + step])
+
+
 def stored_in(folder: Path) -> dict[Path, Stored]:
     """List all files below a folder of a split, as the store has them now.
 
@@ -205,7 +212,14 @@ class RemoteFile:
         self._name, self._cache = sha256(names.encode()).hexdigest()[:32], _cache()
 
     def read(self, spans: Sequence[tuple[int, int]]) -> Iterator[bytes]:
-        """Fetch missing pieces, then yield the bytes of each span (first byte, number of bytes).
+        """Fetch missing pieces, then yield the bytes of each span (first byte, number of bytes). Raises as `fetch`."""
+        self.fetch(spans)
+        for first, length in spans:
+            pieces = range(first // PIECE, -(-(first + length) // PIECE))
+            yield b"".join(self._part(n, max(first - n * PIECE, 0), first + length - n * PIECE) for n in pieces)
+
+    def fetch(self, spans: Sequence[tuple[int, int]]) -> None:
+        """Fetch the pieces of these spans that the cache does not have.
 
         Raises:
             OSError: the file has changed.
@@ -215,9 +229,6 @@ class RemoteFile:
         missing = [n for n in sorted(wanted) if not self._cache.has(self._piece(n))]
         if missing:
             at_once(self.path, self._keep, _runs(missing))
-        for first, length in spans:
-            pieces = range(first // PIECE, -(-(first + length) // PIECE))
-            yield b"".join(self._part(n, max(first - n * PIECE, 0), first + length - n * PIECE) for n in pieces)
 
     def close(self) -> None:
         """Do nothing: a remote file holds no resource."""

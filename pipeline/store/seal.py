@@ -48,11 +48,13 @@ from levelproof.pipeline.store.manifest import (
 )
 from levelproof.pipeline.store.merge import Place, merge_shards
 from levelproof.pipeline.store.publish import publishing
-from levelproof.pipeline.store.remote import is_remote
-from levelproof.pipeline.store.shard import Shard, damaged, read_together, refuse_unlike, write_shard
+from levelproof.pipeline.store.remote import at_once, is_remote
+from levelproof.pipeline.store.requests import REQUESTS
+from levelproof.pipeline.store.shard import Shard, read_together, reading, refuse_unlike, write_shard
 
 ROWS = 100_000  # rows per sealed fragment, roughly; more: fewer files, but more to rewrite when levels are added
 CONVERTED = 256  # levels in memory at a time when their density changes: 300 MB for size l
+REMOVED = 64  # fragments or shards that are removed together, before the caller may stop the seal
 CROWD = 1_000  # unsealed neighbours that are merged even if they have fewer rows: many small files are slow to read
 
 
@@ -129,13 +131,13 @@ def seal(
     paths = {piece.path for piece in pieces}
     if is_remote(split):
         fragment_paths(split)  # drops cached metadata of its files
-    parts = _read(paths, moved)
+    parts = _read(split, paths, moved)
     table, about = each_once(parts)[0], parts[0][0]
     shards = {name: data_path(split, name) for name in named_by([rows for _, rows in parts], "shard")}
     replaced = _replaced(split, shards, paths)
     digests = {name: files for fragment, _ in parts for name, files in fragment.digests.items()}
-    _require_committed(shards, digests)
-    places, between, disowned = _places(table, shards, moved), list[Path](), list[Path]()
+    encodings = _committed_encodings(split, shards, digests, moved)
+    places, between, disowned = _places(table, shards, encodings), list[Path](), list[Path]()
     densities = frozenset([stored_as(*density)]) if density else frozenset().union(*(one.densities for one, _ in parts))
     first, last = (int(table.column("level_id")[i].as_py()) for i in (0, -1))
     unit, count = unit_name(first, last), 1 if density else len(places)
@@ -151,23 +153,21 @@ def seal(
         disown(replaced)
         write_fragment(attempts[0], _moved(table, merged), about.config_hash, about.config, True, densities, digests)
     sealed = fragment_path(split, unit)
-    for path in paths - {sealed}:
-        moved(0)
-        remove(path)
-    for shard in replaced:
-        moved(0)
-        drop(shard)
+    for old, gone in (sorted(paths - {sealed}), remove), (replaced, drop):
+        for first in range(0, len(old), REMOVED):
+            moved(0)
+            gone(*old[first : first + REMOVED])
     return Piece(sealed, table.num_rows, True)
 
 
-def _read(paths: Iterable[Path], moved: Callable[[int], None]) -> list[tuple[Fragment, pa.Table]]:
+def _read(split: Path, paths: Iterable[Path], moved: Callable[[int], None]) -> list[tuple[Fragment, pa.Table]]:
     """Read fragments with their rows, ordered by level ids."""
 
     def read(path: Path) -> tuple[Fragment, pa.Table]:
         moved(0)
         return read_fragment(path)
 
-    with ThreadPoolExecutor(THREADS) as threads:
+    with ThreadPoolExecutor(REQUESTS if is_remote(split) else THREADS) as threads:
         return list(threads.map(read, sorted(paths)))
 
 
@@ -184,27 +184,29 @@ def _replaced(split: Path, shards: Mapping[str, Path], paths: Collection[Path]) 
     return [shard for name, shard in shards.items() if name not in elsewhere or name not in named]
 
 
-def _require_committed(shards: Mapping[str, Path], digests: Mapping[str, Mapping[str, str]]) -> None:
-    """Check the metadata of shards against their digests; chunks are checked as they are copied.
+def _committed_encodings(
+    split: Path, shards: Mapping[str, Path], digests: Mapping[str, Mapping[str, str]], moved: Callable[[int], None]
+) -> dict[str, Encoding]:
+    """Return the encodings of shards, whose metadata must have their digests; chunks are checked as they are copied.
 
     Raises:
         Failure: metadata has changed; a merged shard would have a valid digest over the change.
     """
-    for name, path in shards.items():
-        try:
-            wrong = altered(path, digests.get(name, {}), "zarr.json")
-        except OSError as error:
-            raise damaged(path, error) from error
-        if wrong:
-            raise damaged(path, ContentsError(f"its {wrong[0]} is not what was committed"))
 
-
-def _places(table: pa.Table, shards: Mapping[str, Path], moved: Callable[[int], None]) -> dict[Encoding, list[Place]]:
-    """Return the places of these rows' trajectories, by encoding."""
-    encodings = {}
-    for name, path in shards.items():
+    def encoding(name: str) -> Encoding:
         moved(0)
-        encodings[name] = Shard(path).encoding
+        with reading(shards[name]):
+            if wrong := altered(shards[name], digests.get(name, {}), "zarr.json"):
+                raise ContentsError(f"its {wrong[0]} is not what was committed")
+        return Shard(shards[name]).encoding
+
+    return dict(zip(shards, at_once(split, encoding, shards), strict=True))
+
+
+def _places(
+    table: pa.Table, shards: Mapping[str, Path], encodings: Mapping[str, Encoding]
+) -> dict[Encoding, list[Place]]:
+    """Return the places of these rows' trajectories, by encoding."""
     by_encoding: dict[Encoding, list[Place]] = {}
     columns = (table.column(column).to_pylist() for column in ("shard", "row", "level_id"))
     for name, row, level_id in zip(*columns, strict=True):

@@ -272,7 +272,7 @@ def _read_alike(parts: Sequence[Part], table: Sequence[FieldSpec], places: Seque
     packed = empty(known, dict.fromkeys(field.array for field in chosen), sum(len(rows) for _, rows in parts))
 
     def put(part: Part, mine: Sequence[int]) -> None:
-        with _reading(part[0]):
+        with reading(part[0].path):
             part[0].put(part[1], packed, mine)
 
     at_once(parts[0][0].path, put, parts, places)
@@ -282,7 +282,7 @@ def _read_alike(parts: Sequence[Part], table: Sequence[FieldSpec], places: Seque
         stored = _named(packed, chosen, size)
     except ValueError:  # find the shard with invalid values
         for (shard, _), mine in zip(parts, places, strict=True):
-            with _reading(shard):
+            with reading(shard.path):
                 _named({name: x[np.asarray(mine)] for name, x in packed.items()}, chosen, size)
         raise
     if names == {field.name for field in table}:  # nothing is left to compute
@@ -316,11 +316,12 @@ def _named(packed: Mapping[str, np.ndarray], table: Sequence[FieldSpec], size: S
 
 
 @contextmanager
-def _reading(shard: Shard) -> Iterator[None]:
+def reading(shard: Path) -> Iterator[None]:
+    """Raise the Failure of a damaged shard for what reading it in the `with` block raises."""
     try:
         yield
     except DAMAGE as error:
-        raise damaged(shard.path, error) from error
+        raise damaged(shard, error) from error
 
 
 def damaged(shard: Path, error: Exception) -> Failure:

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -32,6 +33,7 @@ from levelproof.pipeline.store.event_files import KEPT, events_of, new_run, runs
 from levelproof.pipeline.store.layout import (
     FRAGMENT,
     WRITER_LOCK,
+    attempt_of,
     begun_path,
     data_paths,
     fragment_path,
@@ -355,6 +357,34 @@ def test_interrupted_seal_removes_only_the_marks_that_it_made_and_at_once(
         seal(THERE, pieces)
     assert server.count - counts[0] == requests_after
     assert remote.stored_in(THERE) == before
+
+
+def test_seal_makes_the_requests_for_all_shards_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each request that names one of the shards is answered when the others have come, or else counts as alone."""
+    bucket, barriers, alone = bucket_of(tmp_path / "s3"), dict[str, threading.Barrier](), list[str]()
+    names = re.compile("never")
+
+    def answers(method: str, path: str, headers: dict[str, str], body: bytes) -> Answer:
+        kind, named = names.subn("SHARD", f"{method} {path}")
+        if named and not alone:
+            try:
+                barriers.setdefault(kind, threading.Barrier(LEVELS // UNIT)).wait(patience(5))
+            except threading.BrokenBarrierError:
+                alone.append(kind)
+        return bucket(method, path, headers, body)
+
+    monkeypatch.setattr(leases, "POLL", 0.02)
+    with serving_bucket(monkeypatch, tmp_path, patience(30), answers) as server:
+        drive(OUT)
+        pieces = list(map(Piece.of, read_manifest(THERE).fragments))
+        names = re.compile("|".join(map(attempt_of, data_paths(THERE))))
+        begun = server.count
+        seal(THERE, pieces)
+        log, shards = server.log[begun:], LEVELS // UNIT
+    assert barriers
+    assert not alone
+    assert sum(line.startswith("POST") for line in log) == 4, "fragments, shards, their marks, and the seal's own"
+    assert sum("list-type" in line and "continuation" not in line for line in log) == 1 + 3 * shards
 
 
 @pytest.mark.campaign
