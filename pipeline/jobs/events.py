@@ -52,7 +52,7 @@ class Events:
     def _state(self, event: str, rate: float, left: float | None) -> dict[str, Any]:
         tally, now = self._tally, time.monotonic()
         silent: dict[str, list[float]] = defaultdict(list)  # s since the last report, of each worker by host
-        for worker, assignment in self._scheduler.workers.items():
+        for worker, assignment in self._scheduler.workers.items() if not tally.unsealed else ():  # none runs any more
             silent[getattr(worker, "host", str(worker))].append(round(max(0.0, now - assignment.heard), 1))
         return _event(
             event,

@@ -154,8 +154,8 @@ def _make(
         with (
             logged(job, split, board.say) as log,
             board.shown(),
-            sealing(split, manifest.counting, board.say) as sealer,
             recording(split, board, scheduler, shlex.join(command), log) as events,
+            sealing(split, manifest.counting, board.say, board.sealing) as sealer,
         ):
             _work(job, split, scheduler, board, sealer, events, stop)
     except KeyboardInterrupt:

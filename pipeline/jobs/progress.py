@@ -12,7 +12,7 @@ from rich.progress import Progress
 from levelproof.experts.steps import NO_SECONDS, EnvSteps, Seconds
 from levelproof.pipeline.jobs.schedule import Round, Summary, WorkUnit
 from levelproof.pipeline.store.progress_bar import LINE_EVERY, TextBar, say
-from levelproof.pipeline.words import duration
+from levelproof.pipeline.words import duration, many
 
 LINE_AFTER = 2.0  # s between plain lines that report commits; the last commit is always reported
 STOPPING = "Stopping once decided levels are committed; press Ctrl-C to quit now."
@@ -30,6 +30,7 @@ class Tally:
     running: dict[WorkUnit, tuple[int, float, int]] = field(default_factory=dict)  # env steps, levels, solved
     spent: EnvSteps = field(default_factory=EnvSteps)  # env steps spent on this run's committed units
     seconds: Seconds = NO_SECONDS  # workers' time on the same units
+    unsealed: int = 0  # groups of fragments that are left to seal after the last commit
     compiled: tuple[int, int] = (0, 0)  # programs that workers have compiled before they begin, and all of them
 
     def follow(self, round: Round) -> None:
@@ -73,7 +74,9 @@ class Tally:
     def text(self, rate: float, left: float | None) -> str:
         """Describe the progress, at `rate` env steps/s and with `left` s to go (None: not known yet)."""
         pace, (compiled, programs) = f"{rate:,.0f} env steps/s", self.compiled
-        if self.decided == self.levels:
+        if self.unsealed:
+            tail = f"sealing, {many(self.unsealed, 'group')} of fragments left"
+        elif self.decided == self.levels:
             tail = "done" if self.done == self.levels else "writing"
         elif left is None:
             of_them = f", {compiled} of {programs} programs" if compiled < programs else ""
@@ -127,6 +130,12 @@ class Board:
         if round.unsaved and not self._unsaved:
             self.say(f"Unfinished experts cannot be saved ({round.unsaved}): if this run is stopped, they start again.")
             self._unsaved = True
+
+    def sealing(self, groups: int) -> None:
+        """Show the number of groups of fragments that are left to seal after the last commit; 0 ends this."""
+        if groups or self.tally.unsealed:
+            self.tally.unsealed = groups
+            self.refresh(working=False)
 
     def ended(self, unit: WorkUnit, summary: Summary | None) -> None:
         """Pass an attempt to the tally, and show the new numbers if it committed levels."""

@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -25,6 +25,8 @@ from levelproof.pipeline.store.seal import Piece, seal
 from levelproof.pipeline.store.split import taken
 from levelproof.pipeline.urls import as_typed, quoted
 from levelproof.pipeline.words import many
+
+SHOWN_EVERY = 1.0  # s
 
 
 @stoppable()
@@ -81,12 +83,20 @@ class _Stopped(Exception):
 
 
 @contextmanager
-def sealing(split: Path, fragments: Iterable[Fragment], tell: Callable[[str], None]) -> Iterator["Sealer"]:
-    """Run a `Sealer` during the `with` block. At its end, seal every full group; if the block fails, stop at once."""
+def sealing(
+    split: Path,
+    fragments: Iterable[Fragment],
+    tell: Callable[[str], None],
+    show: Callable[[int], object] = lambda _: None,
+) -> Iterator["Sealer"]:
+    """Run a `Sealer` during the `with` block. At its end, seal every full group; if the block fails, stop at once.
+
+    Meanwhile `show` receives the number of groups left, every SHOWN_EVERY seconds.
+    """
     sealer = Sealer(split, fragments, tell)
     try:
         yield sealer
-        sealer.finish()
+        sealer.finish(show)
     finally:
         sealer.stop()
 
@@ -103,6 +113,7 @@ class Sealer:
         self._pieces = {fragment.path: Piece.of(fragment) for fragment in fragments}
         self._thread, self._stop = ThreadPoolExecutor(1), threading.Event()
         self._running: tuple[list[Piece], Future[Piece]] | None = None
+        self._left = 0  # groups to seal when the last seal began, including its own
         self._broken = False
 
     def committed(self, unit: str, levels: int) -> None:
@@ -122,16 +133,19 @@ class Sealer:
         if self._broken:
             return
         end = None if first is None else fragment_path(self._split, unit_name(first, first))
-        group = store.due((piece for piece in self._pieces.values() if end is None or piece.path < end), store.ROWS)
-        if group:
-            self._running = group, self._thread.submit(self._seal, group)
+        groups = store.due((piece for piece in self._pieces.values() if end is None or piece.path < end), store.ROWS)
+        self._left = len(groups)
+        if groups:
+            self._running = groups[0], self._thread.submit(self._seal, groups[0])
 
-    def finish(self) -> None:
-        """Seal every full group; no unit will be committed any more."""
+    def finish(self, show: Callable[[int], object] = lambda _: None) -> None:
+        """Seal every full group; no unit will be committed any more. `show` is that of `sealing`."""
         self.advance(None)
         while self._running:
-            self._running[1].exception()  # waits
+            show(self._left)
+            wait([self._running[1]], SHOWN_EVERY)
             self.advance(None)
+        show(0)
 
     def stop(self) -> None:
         """Stop at once and delete a half-written sealed fragment."""

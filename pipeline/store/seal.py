@@ -89,15 +89,16 @@ def plan(pieces: Iterable[Piece], rows: int) -> list[list[Piece]]:
     return [group for group in groups if len(group) > 1 or any(not piece.sealed for piece in group)]
 
 
-def due(pieces: Iterable[Piece], rows: int) -> list[Piece] | None:
-    """Return what a running job should merge now: neighbours with enough rows, or a crowd. None: nothing yet."""
+def due(pieces: Iterable[Piece], rows: int) -> list[list[Piece]]:
+    """Return the groups that a running job should merge now: neighbours with enough rows, or crowds."""
+    groups = []
     for group in plan(pieces, rows):
         if sum(piece.rows for piece in group) >= rows:
-            return group
-        for sealed, run in groupby(group, lambda piece: piece.sealed):
-            if not sealed and len(crowd := list(run)) >= CROWD:
-                return crowd
-    return None
+            groups.append(group)
+            continue
+        runs = (list(run) for sealed, run in groupby(group, lambda piece: piece.sealed) if not sealed)
+        groups += [run for run in runs if len(run) >= CROWD]
+    return groups
 
 
 def seal(

@@ -39,5 +39,8 @@ def test_events_publish_the_start_the_latest_events_and_the_state(monkeypatch: p
     assert (state["spent"]["trained"], state["seconds"]["training"]) == (300 * MAX_EVENTS, 1.5 * MAX_EVENTS)
     assert state["workers"]["here"]["count"] == 1
     assert sum(len(json.dumps(event)) for event in published[-1]) < 2**20
+    tally.unsealed = 1
+    events.refresh(0.0, None)
+    assert published[-1][-1]["workers"] == {}, "they have ended, and are not silent"
     events.over("stopped")
     assert (published[-1][-1]["event"], published[-1][-1]["how"]) == ("ended", "stopped")

@@ -158,6 +158,14 @@ def test_tally_text_says_writing_until_all_levels_are_committed() -> None:
     assert now.text(0.0, None) == "16/16 levels · 5 solved · writing"
 
 
+def test_board_shows_the_groups_that_are_left_to_seal() -> None:
+    board, text = board_at(Tally(levels=16, done=16, solved=5), [0.0])
+    board.sealing(0)
+    assert not text.getvalue(), "nothing was left"
+    board.sealing(2)
+    assert text.getvalue() == "16/16 levels · 5 solved · sealing, 2 groups of fragments left\n"
+
+
 def test_board_shows_a_bar_on_a_terminal() -> None:
     text = io.StringIO()
     board = Board(tally(), Console(file=text, force_terminal=True, width=160))

@@ -1,17 +1,27 @@
 """Sealing during a job: committed units are merged while others come, in any order; errors never end the job."""
 
 import random
+import sys
 from collections.abc import Callable, Collection
 from pathlib import Path
+from typing import Any
 
 import pytest
+from rich.console import Console
 
 from levelproof.experts.labels import Label
+from levelproof.pipeline.jobs import inline
+from levelproof.pipeline.jobs import seal as jobs
+from levelproof.pipeline.jobs.generate import generate
 from levelproof.pipeline.jobs.schedule import WorkUnit
 from levelproof.pipeline.jobs.seal import Sealer, sealing
 from levelproof.pipeline.store import seal as store
+from levelproof.pipeline.store.event_files import events_of, runs_in
 from levelproof.pipeline.store.layout import attempt_of, begun_path
 from levelproof.pipeline.store.manifest import read_manifest
+from levelproof.pipeline.store.seal import Piece
+from tests.pipeline import slow_seal
+from tests.pipeline.driver import LEVELS, SPLIT, job_of
 from tests.pipeline.made import commit_copy, made_split
 
 Make = Callable[[Sealer, WorkUnit, Collection[WorkUnit]], None]
@@ -70,6 +80,32 @@ def test_sealer_waits_for_running_units_but_not_for_failed_ones(split: Path, mak
         assert [fragment.rows for fragment in read_manifest(split).fragments] == [3, 1, 1]
         make(sealer, UNITS[2], [])
     assert read_manifest(split).level_ids.tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_sealer_counts_the_groups_that_are_left_after_the_job(split: Path, make: Make) -> None:
+    left: list[int] = []
+    with sealing(split, read_manifest(split, []).fragments, print, left.append) as sealer:
+        for unit in UNITS[2:]:
+            make(sealer, unit, UNITS[:1])  # as if the first unit ran until the end
+        assert not left
+    assert list(dict.fromkeys(left)) == [4, 3, 2, 1, 0]
+
+
+def test_run_ends_after_its_last_seal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    latest: list[str] = []
+
+    def sealed(split: Path, *given: Any) -> Piece:
+        latest.append(events_of(runs_in(split)[-1])[-1]["event"])
+        return store.seal(split, *given)
+
+    monkeypatch.setattr(store, "ROWS", LEVELS)
+    monkeypatch.setattr(jobs, "seal", sealed)
+    monkeypatch.setattr(inline, "run", slow_seal.run)
+    monkeypatch.setattr(sys, "argv", ["", "", "", "0"])  # of `slow_seal`
+    generate(job_of(str(tmp_path)), ["levelproof", "generate"], Console(quiet=True))
+    assert latest == ["progress"]
+    (*_, ended) = events_of(runs_in(tmp_path / SPLIT)[-1])
+    assert (ended["event"], ended["how"]) == ("ended", "done")
 
 
 def test_sealer_reports_an_error_once_and_never_ends_the_job(

@@ -119,11 +119,12 @@ def test_plan_merges_neighbours_and_keeps_large_fragments() -> None:
     assert plan([*reversed(small), large], 10) == [small]
     assert plan([large, half, few], 10) == []  # a sealed one alone
     assert plan([small[0], large, small[1]._replace(path=piece(40, 1, False).path), few], 10)[1][0] == few
-    assert due(small, 6) is None
-    assert due(small, 5) == small
+    assert due(small, 6) == []
+    assert due(small, 5) == [small]
+    assert due(small, 2) == [small[:2], small[2:4]]
     crowd = [piece(100 + i, 1, False) for i in range(CROWD)]
-    assert due([few, *crowd[1:]], 2 * CROWD) is None
-    assert due([few, *crowd], 2 * CROWD) == crowd
+    assert due([few, *crowd[1:]], 2 * CROWD) == []
+    assert due([few, *crowd], 2 * CROWD) == [crowd]
 
 
 def test_plan_never_groups_more_rows_than_a_fragment_may_have() -> None:
