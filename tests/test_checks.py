@@ -17,8 +17,6 @@ ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 UGLY, WRONG, GOOD = "x = [1,2]\n", "import os\n", "x = [1, 2]\n"  # for ruff's formatter, for its linter, for both
 
-pytestmark = pytest.mark.skipif(not (ROOT / ".ci").exists(), reason="an sdist has no .ci")
-
 
 def run(command: list[str | Path]) -> subprocess.CompletedProcess[str]:
     """Run a script with the tools of this environment."""
