@@ -6,18 +6,21 @@ Reads the manifests only, no shards. The splits may differ in budget or procedur
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from rich.console import Console
 from rich.table import Table
 
 from levelproof.experts.labels import TRAINED, WITNESSED, Label
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look import cost
+from levelproof.pipeline.look.duplicates import COMPARED, CONTENT, HALVES, hash_identities
 from levelproof.pipeline.look.inspect import QUANTILES, SPENT
 from levelproof.pipeline.look.query import prepare_for_seeds
 from levelproof.pipeline.read.select import columns_in, labelled, select
@@ -26,7 +29,7 @@ from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.tables import console_for_tables, folded
 from levelproof.pipeline.words import number
 
-READ = (*cost.READ, "content_hash", "signature", "steps_to_goal", *SPENT)
+READ = (*cost.READ, "steps_to_goal", *SPENT)
 LABELS = [label.value for label in Label]
 
 
@@ -48,10 +51,7 @@ def diff(one: Path, other: Path, where: str | None, rows: int, as_json: bool) ->
 
 def compare(one: Path, other: Path, where: str | None = None, rows: int = 10) -> dict[str, Any]:
     """Collect the facts that `diff` prints, as JSON types."""
-    reads = (one, columns_in(where)), (other, ())
-    manifests = [require_manifest(split, [*READ, *columns], compact=True) for split, columns in reads]
-    chosen = select(manifests[0].table, where)
-    left, right = _common(chosen, manifests[1].table, (one, other))
+    (left, right), manifests, alone = _read((one, other), where)
     solved, tried = np.stack([labelled(rows, WITNESSED) for rows in (left, right)]), labelled(left, TRAINED)
     tried |= labelled(right, TRAINED)
     only = [solved[i] & ~solved[1 - i] for i in range(2)]
@@ -65,10 +65,7 @@ def compare(one: Path, other: Path, where: str | None = None, rows: int = 10) ->
         "splits": [as_typed(one), as_typed(other)],
         "settings": differences(*(manifest.config or {} for manifest in manifests)),  # that decide results and differ
         "levels": left.num_rows,
-        "alone": [
-            chosen.num_rows - left.num_rows,
-            manifests[1].table.num_rows - left.num_rows if where is None else None,
-        ],
+        "alone": alone,
         "solved": [{"solved": hits, "tried": tries} for hits, tries in counts],
         "both": int((solved[0] & solved[1]).sum()),
         "neither": int((~solved[0] & ~solved[1] & tried).sum()),
@@ -92,8 +89,24 @@ def exact_p(fewer: int, more: int) -> float:
     return float(min(1.0, 2 * np.exp(np.concatenate([[0.0], ratios]) - flips * np.log(2)).sum()))
 
 
+def _read(
+    splits: tuple[Path, Path], where: str | None
+) -> tuple[tuple[pa.Table, pa.Table], list[Manifest], list[int | None]]:
+    """Read the rows (READ) of levels in both splits, the manifests without rows, and the numbers of other levels."""
+    manifests = []
+    for split, columns in zip(splits, ([*READ, *columns_in(where)], READ), strict=True):
+        hashed = partial(hash_identities, kept=columns)
+        manifests.append(require_manifest(split, [*columns, *COMPARED], compact=True, each=hashed))
+    chosen, others = select(manifests[0].table, where), manifests[1].table
+    common = _common(chosen, others, splits)
+    alone = [rows.num_rows - common[0].num_rows for rows in (chosen, others)]
+    nothing = chosen.schema.empty_table()  # so that memory holds the rows of other levels no longer
+    manifests = [replace(manifest, table=nothing) for manifest in manifests]
+    return common, manifests, [alone[0], alone[1] if where is None else None]
+
+
 def _common(one: pa.Table, other: pa.Table, splits: tuple[Path, Path]) -> tuple[pa.Table, pa.Table]:
-    """Select the rows of levels that are in both tables, in the same order.
+    """Select the rows (from `hash_identities`) of levels that are in both tables, in the same order.
 
     A level's content hash may differ between stacks, whose bits differ; half of its signature still matches.
 
@@ -105,14 +118,14 @@ def _common(one: pa.Table, other: pa.Table, splits: tuple[Path, Path]) -> tuple[
     if not len(here):
         raise UserError(f"{sides} have no level in common: give two splits of the same levels.")
     left, right = one.take(here), other.take(there)
-    unlike = np.flatnonzero(pc.not_equal(left["content_hash"], right["content_hash"]))  # pyright: ignore[reportAttributeAccessIssue]
-    for index in unlike.tolist():
-        if not set(left["signature"][index].as_py()) & set(right["signature"][index].as_py()):
-            raise UserError(
-                f"Level {left['level_id'][index]} differs between {sides}: "
-                "give two splits of one size and one distribution."
-            )
-    return left, right
+    same = lambda mine, theirs: left[mine].to_numpy() == right[theirs].to_numpy()
+    alike = np.logical_or.reduce([same(CONTENT, CONTENT), *(same(*pair) for pair in product(HALVES, HALVES))])
+    if not alike.all():
+        raise UserError(
+            f"Level {left['level_id'][int(alike.argmin())]} differs between {sides}: "
+            "give two splits of one size and one distribution."
+        )
+    return left.select(["level_id", *READ]), right.select(["level_id", *READ])
 
 
 def _spent(rows: pa.Table, manifest: Manifest) -> dict[str, int] | None:

@@ -1,6 +1,7 @@
 """Comparison of two splits of the same levels: what only one solved, at what cost, and whether that is significant."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from levelproof.pipeline.look import cost
 from levelproof.pipeline.look.diff import compare, diff, exact_p
 from levelproof.pipeline.store.layout import split_path
 from tests.pipeline.made import made_job, made_result, made_split
+from tests.pipeline.verify.forged import forge
 
 S, U, T = Label.SOLVED, Label.UNSOLVED, Label.TRIVIAL
 HERE, THERE = [S, S, U, T, U, S], [S, U, S, T, U, S, S]  # only the second split has the last level
@@ -95,6 +97,15 @@ def test_diff_prints_words_or_json(splits: tuple[Path, Path], capsys: pytest.Cap
     assert f"Solved only in {splits[1]}: 2, ..." in output
     diff(*splits, "level_id < 2", 1, as_json=True)
     assert json.loads(capsys.readouterr().out)["levels"] == 2
+
+
+def test_levels_that_share_half_of_a_signature_are_compared(splits: tuple[Path, Path], tmp_path: Path) -> None:
+    near = shutil.copytree(splits[0], tmp_path / "near")
+    forge(near, lambda row: row.update(content_hash="c1:other", signature=["n1:other", row["signature"][0]]), [3])
+    assert compare(near, splits[1])["levels"] == 7
+    forge(near, lambda row: row.update(signature=["n1:other", "n1:another"]), [3])
+    with pytest.raises(UserError, match=r"^Level 3 differs between"):
+        compare(near, splits[1])
 
 
 def test_compare_refuses_different_levels(splits: tuple[Path, Path], tmp_path: Path) -> None:
