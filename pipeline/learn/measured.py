@@ -1,6 +1,6 @@
 """The levels that a policy is measured on: of a split, of level files, or sealed ones."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -13,7 +13,8 @@ from jaxtyping import Bool, Int
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.labels import Label
 from levelproof.levelgen.batching import take
-from levelproof.levelgen.level import Level, name_of, size_of
+from levelproof.levelgen.identity.keys import SAMPLER_VERSION
+from levelproof.levelgen.level import Level, concatenate_levels, name_of, size_of
 from levelproof.levelgen.sampling.sampler import check_size, on_cpu, sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 from levelproof.pipeline.dataset.dataset import Dataset
@@ -24,11 +25,13 @@ from levelproof.pipeline.read.levels import COLUMNS, levels_of, rules_of
 from levelproof.pipeline.read.select import labelled, require_selected
 from levelproof.pipeline.store.job_note import sound_note
 from levelproof.pipeline.store.manifest import fragment_paths, refuse_folder_of_splits, require_manifest
+from levelproof.pipeline.store.progress_bar import shown_blocks
 from levelproof.pipeline.store.remote import as_typed, is_remote
 from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.urls import quoted
 
 AT_ONCE = 256  # witnesses per read
+LEVELS_AT_ONCE = 2**14  # levels per read, with their records up to 100 MB; each read opens its shards
 
 
 class MeasuredLevels(NamedTuple):
@@ -41,6 +44,7 @@ class MeasuredLevels(NamedTuple):
     solved: Bool[np.ndarray, " level"] | None  # whether they are labelled solved; None: they have no labels
     start: float = 0.0  # step of a witness from whose state attempts start, as a share of its steps to the goal
     published: Mapping[str, float] = MappingProxyType({})  # published solve rates on these levels, by agent
+    content_hashes: Sequence[str] | None = None  # None: not known
 
     def first(self, count: int | None) -> "MeasuredLevels":
         """Return the first `count` levels; None: all."""
@@ -48,7 +52,9 @@ class MeasuredLevels(NamedTuple):
             return self
         some = np.arange(len(self.level_ids))[:count]
         solved = None if self.solved is None else self.solved[some]
-        return self._replace(level_ids=self.level_ids[some], levels=take(self.levels, some), solved=solved)
+        hashes = None if self.content_hashes is None else self.content_hashes[:count]
+        levels = take(self.levels, some)
+        return self._replace(level_ids=self.level_ids[some], levels=levels, solved=solved, content_hashes=hashes)
 
 
 def sealed_levels(size: str, count: int | None) -> MeasuredLevels:
@@ -114,9 +120,15 @@ def _of_split(split: Path, where: str | None, count: int | None) -> MeasuredLeve
         raise UserError(
             f"{split} has no level that meets the condition: `levelproof inspect {quoted(split)}` shows its levels."
         )
-    levels, solved = levels_of(manifest, rows), labelled(rows, [Label.SOLVED])
-    name = f"{as_typed(split)}, {name_of(levels.size)}"
-    return MeasuredLevels(name, rows["level_id"].to_numpy(), levels, rules_of(manifest), solved)
+    blocks = shown_blocks(rows.num_rows, LEVELS_AT_ONCE, "levels read", least=LEVELS_AT_ONCE + 1)
+    read = lambda first: levels_of(manifest, rows.slice(first, LEVELS_AT_ONCE))
+    levels = concatenate_levels([jax.tree.map(np.array, read(first)) for first in blocks])  # copied: views keep records
+    name, ids = f"{as_typed(split)}, {name_of(levels.size)}", rows["level_id"].to_numpy()
+    # Rows of a split have the hashes of what its version sampled; those of seeds are hashed when they are read
+    same = is_seed(split) or (manifest.config or {}).get("sampler_version") == SAMPLER_VERSION
+    hashes = rows["content_hash"].to_pylist() if same else None
+    solved = labelled(rows, [Label.SOLVED])
+    return MeasuredLevels(name, ids, levels, rules_of(manifest), solved, content_hashes=hashes)
 
 
 def midway_levels(data: Dataset, count: int | None, start: float) -> MeasuredLevels:

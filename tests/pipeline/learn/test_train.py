@@ -24,8 +24,8 @@ from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.levelgen.task.lanes import FIRST_EXTRA
 from levelproof.levelgen.task.rules import DEFAULT_RULES
 from levelproof.pipeline.exchange.level_json import export
+from levelproof.pipeline.learn import measured, sealed, trained_on
 from levelproof.pipeline.learn import run as writer
-from levelproof.pipeline.learn import sealed, trained_on
 from levelproof.pipeline.learn import train as module
 from levelproof.pipeline.learn.measured import levels_in
 from levelproof.pipeline.learn.metrics import Metrics
@@ -253,7 +253,10 @@ def test_levels_are_replayed(of_split: bool, split: Path, tmp_path: Path) -> Non
 
 def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     messages: list[str] = []
-    source = levels_for(TrainConfig(levels=str(split), where="label = 'solved'"), messages.append)
+    with monkeypatch.context() as patch:
+        patch.setattr(measured, "LEVELS_AT_ONCE", 3)
+        patch.setattr(trained_on, "content_hashes", None)  # those of the rows are known
+        source = levels_for(TrainConfig(levels=str(split), where="label = 'solved'"), messages.append)
     data = levelproof.open(split, where="label = 'solved'")
     ids = data.manifest["level_id"].to_pylist()
     assert source.facts["count"] == len(source.levels) == len(ids)
