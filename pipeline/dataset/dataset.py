@@ -47,8 +47,9 @@ from levelproof.pipeline.words import many
 
 EPISODES_AT_ONCE = 1024  # read together for batches of episodes, so that many lanes are busy
 # Shards whose ids and indices are cached. These take 9 kB a shard and 24 to 88 bytes a level, less than the level's
-# manifest row; no file stays open. Opening a shard of 100,000 levels again takes a tenth of a second
+# manifest row. Opening a shard of 100,000 levels again takes a tenth of a second
 OPEN_SHARDS = 4096
+OPEN_SEEDS = 256  # seed files whose tables are mapped, one or two open files each
 ALWAYS_FIELDS = ("record/action", "record/reward", "record/done", "record/goal")
 
 
@@ -105,7 +106,7 @@ class Dataset:
         check_share(validation)
         self._validation, self._differing = float(validation), Differing(split, differing)
         self._trajectories = TrajectoryRows(split, where, columns, fingerprint)
-        self._shard = lru_cache(OPEN_SHARDS)(open_shard)
+        self._shard = lru_cache(OPEN_SEEDS if self._trajectories.of_seeds else OPEN_SHARDS)(open_shard)
         self.rules, self.simulates = self._trajectories.rules, self._trajectories.simulates
 
     @property

@@ -66,6 +66,7 @@ class Events:
             left=None if left is None else round(left),
             failures=self._failures,
             quarantined=len(self._scheduler.quarantined),
+            unsealed=tally.unsealed,
             workers={host: {"count": len(seconds), "silent": max(seconds)} for host, seconds in silent.items()},
         )
 

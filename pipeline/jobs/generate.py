@@ -154,10 +154,11 @@ def _make(
         with (
             logged(job, split, board.say) as log,
             board.shown(),
+            sealing(split, manifest.counting, board.say) as sealer,
             recording(split, board, scheduler, shlex.join(command), log) as events,
-            sealing(split, manifest.counting, board.say, board.sealing) as sealer,
         ):
             _work(job, split, scheduler, board, sealer, events, stop)
+            sealer.finish(board.sealing)  # before the run's last event
     except KeyboardInterrupt:
         board.say(f"Stopped: {tally.done:,} of {count} committed; run the same command to continue.")
         raise

@@ -83,20 +83,12 @@ class _Stopped(Exception):
 
 
 @contextmanager
-def sealing(
-    split: Path,
-    fragments: Iterable[Fragment],
-    tell: Callable[[str], None],
-    show: Callable[[int], object] = lambda _: None,
-) -> Iterator["Sealer"]:
-    """Run a `Sealer` during the `with` block. At its end, seal every full group; if the block fails, stop at once.
-
-    Meanwhile `show` receives the number of groups left, every SHOWN_EVERY seconds.
-    """
+def sealing(split: Path, fragments: Iterable[Fragment], tell: Callable[[str], None]) -> Iterator["Sealer"]:
+    """Run a `Sealer` during the `with` block. At its end, seal every full group; if the block fails, stop at once."""
     sealer = Sealer(split, fragments, tell)
     try:
         yield sealer
-        sealer.finish(show)
+        sealer.finish()
     finally:
         sealer.stop()
 
@@ -139,7 +131,8 @@ class Sealer:
             self._running = groups[0], self._thread.submit(self._seal, groups[0])
 
     def finish(self, show: Callable[[int], object] = lambda _: None) -> None:
-        """Seal every full group; no unit will be committed any more. `show` is that of `sealing`."""
+        """Seal every full group; no unit will be committed any more. `show` receives the number of groups left, every
+        SHOWN_EVERY seconds."""
         self.advance(None)
         while self._running:
             show(self._left)

@@ -28,7 +28,7 @@ from levelproof.pipeline.words import duration, many
 INTERVAL = 2.0  # s between refreshes
 STALE = 30.0  # s; an older state of a run is shown with its age
 SHOWN = 5  # maximum number of failures shown
-STATE = {"levels", "done", "solved", "env_steps", "rate", "left", "failures", "quarantined", "workers"}
+STATE = {"levels", "done", "solved", "env_steps", "rate", "left", "failures", "quarantined", "unsealed", "workers"}
 FAILURE = {"unit", "cause"}
 
 
@@ -97,11 +97,14 @@ def progress_table(facts: dict[str, Any]) -> Table:
     table = Table(box=None, show_header=False, pad_edge=False)
     share = "" if facts["solved_share"] is None else f", {facts['solved_share']:.1%} of them solved"
     left = "..." if facts["left"] is None else f"about {duration(facts['left'])} left"
+    pace = f"{facts['rate']:,} env steps/s, {left}"
+    if facts["unsealed"]:
+        pace = f"sealing, {many(facts['unsealed'], 'group')} of fragments left"
     stale = f" (logged {duration(facts['age'])} ago)" if facts["age"] > STALE else ""
     lines = {
         "split": facts["split"],
         "levels": f"{facts['done']:,} of {facts['levels']:,} committed{share}",
-        "pace": f"{facts['rate']:,} env steps/s, {left}{stale}" if facts["running"] else "no run is active",
+        "pace": f"{pace}{stale}" if facts["running"] else "no run is active",
         "failed attempts": f"{facts['failures']}, {many(facts['quarantined'], 'unit')} given up",
         **{
             f"workers on {host}": f"{workers['count']}, longest silent for {duration(workers['silent'] + facts['age'])}"

@@ -101,7 +101,7 @@ def level_ids_in(level_ids: Any) -> Int[np.ndarray, " level"]:
     """Return the level ids in a shard's attributes; raise ContentsError unless they are ascending, and one or more."""
     good = isinstance(level_ids, list) and {*map(type, level_ids)} == {int}
     ids = np.array(level_ids if good else [], np.int64)
-    if not len(ids) or ids[0] < 0 or ids[-1] > MAX_LEVEL_ID or (np.diff(ids) <= 0).any():
+    if not len(ids) or ids[0] < 0 or ids[-1] > MAX_LEVEL_ID or (ids[1:] <= ids[:-1]).any():
         raise ContentsError("its level ids are not ascending ids of levels")
     return ids
 

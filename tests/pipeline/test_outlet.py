@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from levelproof.experts.labels import Label
+from levelproof.pipeline.look.watch import STATE
 from levelproof.pipeline.outlet import Outlet
 from levelproof.pipeline.store.event_files import new_run, write_events
 from levelproof.pipeline.store.locks import only_writer
@@ -112,7 +113,7 @@ def test_outlet_of_stderr_drops_output_after_any_error() -> None:
 def test_watch_ends_when_its_reader_leaves(split: Path, unread: int) -> None:
     """It ends although the run that it watches continues."""
     workers = {"a machine": {"count": 2, "silent": 1.5}}
-    numbers = dict.fromkeys(("levels", "done", "solved", "env_steps", "rate", "left", "failures", "quarantined"), 1)
+    numbers = dict.fromkeys(STATE - {"workers"}, 1)
     write_events(new_run(split), [{"time": time.time(), "event": "progress", "workers": workers, **numbers}])
     with only_writer(split, print):
         done = levelproof("status", str(split), "--watch", "--json", stdout=unread)

@@ -42,5 +42,6 @@ def test_events_publish_the_start_the_latest_events_and_the_state(monkeypatch: p
     tally.unsealed = 1
     events.refresh(0.0, None)
     assert published[-1][-1]["workers"] == {}, "they have ended, and are not silent"
+    assert published[-1][-1]["unsealed"] == 1
     events.over("stopped")
     assert (published[-1][-1]["event"], published[-1][-1]["how"]) == ("ended", "stopped")

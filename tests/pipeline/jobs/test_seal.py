@@ -84,10 +84,10 @@ def test_sealer_waits_for_running_units_but_not_for_failed_ones(split: Path, mak
 
 def test_sealer_counts_the_groups_that_are_left_after_the_job(split: Path, make: Make) -> None:
     left: list[int] = []
-    with sealing(split, read_manifest(split, []).fragments, print, left.append) as sealer:
+    with sealing(split, read_manifest(split, []).fragments, print) as sealer:
         for unit in UNITS[2:]:
             make(sealer, unit, UNITS[:1])  # as if the first unit ran until the end
-        assert not left
+        sealer.finish(left.append)
     assert list(dict.fromkeys(left)) == [4, 3, 2, 1, 0]
 
 

@@ -18,7 +18,8 @@ from levelproof.pipeline.store.locks import only_writer
 from tests.pipeline.command import assert_refused, here
 from tests.pipeline.made import made_split
 
-STATE = {"levels": 8, "done": 4, "solved": 3, "env_steps": 100, "rate": 12, "left": 7, "failures": 1, "quarantined": 0}
+STATE = {"levels": 8, "done": 4, "solved": 3, "env_steps": 100, "rate": 12, "left": 7, "failures": 1}
+STATE |= {"quarantined": 0, "unsealed": 0}
 
 
 @pytest.fixture
@@ -92,6 +93,9 @@ def test_watch_tells_dead_runs_from_silent_ones(split: Path) -> None:
         with console.capture() as captured:
             console.print(progress_table(facts))
     text = captured.get()
+    with console.capture() as sealing:
+        console.print(progress_table(facts | {"unsealed": 2}))
+    assert "sealing, 2 groups of fragments left" in sealing.get()
     assert "4 of 8 committed, 75.0% of them solved" in text
     assert "logged 10 min ago" in text
     assert "2, longest silent for 10 min" in text
