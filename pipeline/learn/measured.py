@@ -10,10 +10,9 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Bool, Int
 
-from levelproof.configs.schema import JobConfig
+from levelproof.configs.schema import JobConfig, other_sampler
 from levelproof.experts.labels import Label
 from levelproof.levelgen.batching import take
-from levelproof.levelgen.identity.keys import SAMPLER_VERSION
 from levelproof.levelgen.level import Level, concatenate_levels, name_of, size_of
 from levelproof.levelgen.sampling.sampler import check_size, on_cpu, sample_levels
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
@@ -124,9 +123,8 @@ def _of_split(split: Path, where: str | None, count: int | None) -> MeasuredLeve
     read = lambda first: levels_of(manifest, rows.slice(first, LEVELS_AT_ONCE))
     levels = concatenate_levels([jax.tree.map(np.array, read(first)) for first in blocks])  # copied: views keep records
     name, ids = f"{as_typed(split)}, {name_of(levels.size)}", rows["level_id"].to_numpy()
-    # Rows of a split have the hashes of what its version sampled; those of seeds are hashed when they are read
-    same = is_seed(split) or (manifest.config or {}).get("sampler_version") == SAMPLER_VERSION
-    hashes = rows["content_hash"].to_pylist() if same else None
+    # Rows have the hashes of what their own sampler made
+    hashes = None if other_sampler(manifest.config or {}) else rows["content_hash"].to_pylist()
     solved = labelled(rows, [Label.SOLVED])
     return MeasuredLevels(name, ids, levels, rules_of(manifest), solved, content_hashes=hashes)
 
