@@ -123,7 +123,7 @@ def train(
     run: Run[Imitation],
     console: Console,
 ) -> Imitation:
-    """Take the updates that are left; validate, and keep the state, every `config.interval` of them.
+    """Take the updates that are left, or those until a stop; validate, and keep the state, every `config.interval`.
 
     Raises:
         Failure: the weights have diverged.
@@ -146,7 +146,8 @@ def train(
             rate, speed = pace.count(1), ""
             if rate:
                 speed = f" · {rate * config.train.batch:,.0f} samples/s · about {duration((last - update) / rate)} left"
-            words, keep = f"{update:,}/{last:,} updates{speed}", update % config.interval == 0 or update == last
+            words = f"{update:,}/{last:,} updates{speed}"
+            keep = update % config.interval == 0 or update == last or run.stop.is_set()
             if keep:
                 with pace.aside():
                     numbers = {COURSE.step: update, "bc/samples_per_second": rate * config.train.batch or np.nan}
@@ -155,6 +156,8 @@ def train(
                     run.keep(state, numbers, "bc/loss", "train.learning_rate")
                 words = f"{line_of(update, last, numbers)}{speed}"
             bar.show(update, words, keep=keep)
+            if keep and run.stop.is_set():
+                break
     return state
 
 

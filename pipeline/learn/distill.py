@@ -188,7 +188,7 @@ def update_until_done(
     run: Run[Distillation],
     console: Console,
 ) -> Distillation:
-    """Take the rounds that are left; keep the state and its metrics after each.
+    """Take the rounds that are left, or those until a stop; keep the state and its metrics after each.
 
     Raises:
         UserError: no state has a label, and no witness is learned from.
@@ -218,6 +218,8 @@ def update_until_done(
                 words += f" · about {duration((last - until) / rate)} left"
             run.keep(now, numbers, "distill/loss", "train.learning_rate")
             bar.show(until, words, keep=True)
+            if run.stop.is_set():
+                break
     return now
 
 

@@ -1,5 +1,6 @@
 """A training run under way: the metrics, checkpoints and policy that `clone`, `train` and `distill` write."""
 
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from levelproof.pipeline.learn.folder import (
     writing_run,
 )
 from levelproof.pipeline.learn.metrics import Metrics
+from levelproof.pipeline.stopping import stoppable
 
 T = TypeVar("T")
 
@@ -34,6 +36,7 @@ class Run(Generic[T]):
     policy_of: Callable[[dict[str, Any], T], Policy]
     note: dict[str, Any]  # in the folder
     trained: dict[str, Any]  # replaces the note once an update is saved
+    stop: threading.Event  # set once the run is to end after its next save
 
     def save(self, state: T) -> Policy:
         """Write the checkpoint, then the policy; return the policy. Raises as `keep_run` and `require_ours`."""
@@ -86,6 +89,8 @@ def make_policy(
 ) -> None:
     """Lock a run's folder, take the updates that are left, save the policy, and tell the user where it is.
 
+    Ctrl-C and SIGTERM end the run after the update, or the round, that is being taken, which is saved.
+
     Args:
         out: the run's folder.
         note: what decides the run's result; the versions and the device that train it now are added with the first
@@ -98,14 +103,22 @@ def make_policy(
 
     Raises:
         UserError, Failure: as `writing_run`, `require_same_run`, `stacks_in` and `Metrics`.
+        KeyboardInterrupt: the run was stopped.
     """
-    with writing_run(out) as require_ours:
+    with stoppable() as stop, writing_run(out) as require_ours:
         require_same_run(out, note, free)
         state, steps, trains, advance = begin()
         note = note | {MADE_BY: stacks_in(out)}
         trained = with_stack(note, tell) if trains else note
         write_note(out, note)
         with Metrics(out, curves, log if trains else "none", trained, steps, tell, require_ours) as metrics:
-            run = Run(out, metrics, require_ours, policy_of, note, trained)
-            policy = run.save(advance(run) if trains else state)
+            run = Run(out, metrics, require_ours, policy_of, note, trained, stop.asked)
+            if trains:
+                try:
+                    with stop.heeded():
+                        state = advance(run)
+                except KeyboardInterrupt:
+                    tell(f"Stopped: the same command continues the run in {out}.")
+                    raise
+            policy = run.save(state)
     tell_done(out, policy.size, tell)

@@ -161,7 +161,7 @@ def update_until_done(
     run: Run[Learner],
     console: Console,
 ) -> Learner:
-    """Take the updates that are left; keep the learner and its metrics every `interval` of them.
+    """Take the updates that are left, or those until a stop; keep the learner and metrics every `interval` of them.
 
     Raises:
         Failure: the weights have diverged.
@@ -181,7 +181,7 @@ def update_until_done(
                 words += f" · {solved:.1%} solved"
             if rate:
                 words += f" · {rate:,.0f} env steps/s · about {duration((last - update) * per_update / rate)} left"
-            keep = update % interval == 0 or update == last
+            keep = update % interval == 0 or update == last or run.stop.is_set()
             if keep:
                 with pace.aside():
                     numbers = {COURSE.step: update * per_update, "train/updates": update} | averages(recent)
@@ -190,6 +190,8 @@ def update_until_done(
                     recent = []
                     run.keep(learner, numbers, "loss/value", "ppo.learning_rate")
             bar.show(update, words, keep=keep)
+            if keep and run.stop.is_set():
+                break
     return learner
 
 

@@ -1,6 +1,8 @@
 """What the folders of the commands that train a policy hold, and what their guides list."""
 
 import json
+import os
+import signal
 from collections.abc import Mapping
 from dataclasses import is_dataclass
 from pathlib import Path
@@ -14,7 +16,7 @@ from levelproof.configs.compose import override_of
 from levelproof.configs.convert import plain
 from levelproof.configs.meanings import comments_in
 from levelproof.experts.networks.saved import WEIGHTS
-from levelproof.pipeline.learn import run
+from levelproof.pipeline.learn.pace import Pace
 from tests.pipeline.command import ROOT
 
 
@@ -30,15 +32,17 @@ def assert_average_is_kept(out: Path, average: str, last: str) -> None:
     assert any((values != kept[last + name]).any() for name, values in weights.items())
 
 
-def stop_after_saving(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a learner be stopped, as by Ctrl-C, once it has saved a checkpoint."""
-    keep = run.keep_run
+def stop_in_first_update(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a learner get SIGTERM, which batch systems send before they kill it, as its first update or round ends."""
+    count, sent = Pace.count, list[int]()
 
-    def stopped(*arguments: Any) -> None:
-        keep(*arguments)
-        raise KeyboardInterrupt
+    def counting(pace: Pace, done: int) -> float:
+        if not sent:
+            sent.append(done)
+            os.kill(os.getpid(), signal.SIGTERM)
+        return count(pace, done)
 
-    monkeypatch.setattr(run, "keep_run", stopped)
+    monkeypatch.setattr(Pace, "count", counting)
 
 
 def assert_guide_lists(settings: Mapping[str, Any], *pages: str) -> None:

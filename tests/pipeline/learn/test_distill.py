@@ -28,7 +28,7 @@ from levelproof.pipeline.learn.pool import LevelPool
 from levelproof.pipeline.store.checkpoints import begun_like, save_experts
 from levelproof.pipeline.store.layout import EXPERTS
 from tests.pipeline.command import assert_refused, here
-from tests.pipeline.learn.runs import assert_average_is_kept, assert_guide_lists, metrics, stop_after_saving
+from tests.pipeline.learn.runs import assert_average_is_kept, assert_guide_lists, metrics, stop_in_first_update
 from tests.pipeline.made import honest_split, made_job
 
 TINY = ("network.width=8", "network.depth=1", "network.heads=1")
@@ -71,7 +71,7 @@ def test_kept_experts_of_a_split_label_states_and_demonstrate(tmp_path: Path, mo
     out.rename(tmp_path / "both")
     split, alone = tmp_path / "data/5k/s", ("states=0", *TINY, *shown)
     with monkeypatch.context() as patch:
-        stop_after_saving(patch)
+        stop_in_first_update(patch)
         assert here(["distill", str(split), "-o", "policy", *ROUNDS, *alone], tmp_path).returncode == 130
     assert load_file(tmp_path / "policy/checkpoint.safetensors")[".imitation.updates"] == 2
     out = distilled(tmp_path, split, *alone, teachers=())

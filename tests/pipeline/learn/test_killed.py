@@ -29,8 +29,10 @@ LINES = 10  # of metrics, one beside each checkpoint
 TIMES = ("seconds", "per_second")  # ends of the names of metrics that no run repeats
 
 
-@pytest.mark.parametrize("command", RUNS)
-def test_run_that_was_killed_continues_bit_for_bit(command: str, split: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("command", "number"), [*((name, signal.SIGKILL) for name in RUNS), ("clone", signal.SIGTERM)])
+def test_run_that_was_killed_or_stopped_continues_bit_for_bit(
+    command: str, number: signal.Signals, split: Path, tmp_path: Path
+) -> None:
     words = [command, "-o", "policy", *(word.replace("SPLIT", str(split)) for word in RUNS[command])]
     words += TINY
     whole, broken = tmp_path / "whole", tmp_path / "broken"
@@ -40,15 +42,17 @@ def test_run_that_was_killed_continues_bit_for_bit(command: str, split: Path, tm
     assert done.returncode == 0, done.stderr
     process = start(words, broken)
     until(lambda: len(lines(broken)) >= 2, process)  # there is a checkpoint, and the run goes on
-    process.send_signal(signal.SIGKILL)
+    process.send_signal(number)
     process.communicate()
-    assert process.returncode == -signal.SIGKILL, "it had ended before"
-    assert len(lines(broken)) < LINES
+    assert process.returncode == (130 if number == signal.SIGTERM else -number), "it had ended before"
+    saved = len(lines(broken))
+    assert saved < LINES
     done = run(words, broken)
     assert done.returncode == 0, done.stderr
     for name in ("policy.safetensors", "checkpoint.safetensors", "config.json"):
         assert (broken / "policy" / name).read_bytes() == (whole / "policy" / name).read_bytes(), name
-    assert len(lines(broken)) == LINES
+    between = number == signal.SIGTERM and json.loads(lines(broken)[saved - 1])["bc/updates"] % 20
+    assert len(lines(broken)) == LINES + bool(between)
     assert repeatable(lines(broken)[-1]) == repeatable(lines(whole)[-1])
 
 

@@ -32,7 +32,7 @@ from levelproof.pipeline.learn.metrics import Metrics
 from levelproof.pipeline.learn.trained_on import levels_for
 from tests.pace import patience, wait_until
 from tests.pipeline.command import COMMAND_SECONDS, assert_refused, heed_ctrl_c, here, run, start
-from tests.pipeline.learn.runs import assert_average_is_kept, assert_guide_lists, metrics, stop_after_saving
+from tests.pipeline.learn.runs import assert_average_is_kept, assert_guide_lists, metrics, stop_in_first_update
 
 LANES = (
     "ppo.environments=64",
@@ -154,11 +154,11 @@ def continues_bit_for_bit(words: tuple[str, ...], tmp_path: Path, monkeypatch: p
     words = ("interval=2", *words)
     whole = trained(tmp_path / "whole", 4, *words)
     made = programs.cache_info().misses
-    stop_after_saving(monkeypatch)
+    stop_in_first_update(monkeypatch)
     (tmp_path / "stopped").mkdir()
     words_of_four = ["train", "-o", "agent", f"ppo.env_steps={4 * PER_UPDATE}", *LANES, *words]
     assert here(words_of_four, tmp_path / "stopped").returncode == 130
-    assert load_file(tmp_path / "stopped/agent/checkpoint.safetensors")[".updates"] == 2
+    assert load_file(tmp_path / "stopped/agent/checkpoint.safetensors")[".updates"] == 1
     monkeypatch.undo()
     out = trained(tmp_path / "stopped", 4, *words)
     assert programs.cache_info().misses == made, "equal runs share their programs"
