@@ -4,26 +4,18 @@ Takes effect only before JAX starts its backend.
 """
 
 import gc
-import multiprocessing
 import os
-import signal
 import socket
 import sys
 import time
-from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Literal
 
 from loky import cpu_count
 
 from levelproof.pipeline.claims import share_compiling
-from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.owned import own_folder
-
-T = TypeVar("T")
 
 CACHE_VARIABLE = "LEVELPROOF_CACHE_DIR"
 # One single-threaded process per core is twice as fast as one process with XLA's own threads. Besides, a sum split
@@ -195,33 +187,3 @@ def _allowed_cores() -> list[int]:
     if sys.platform == "linux":
         return sorted(os.sched_getaffinity(0))
     return list(range(os.cpu_count() or 1))
-
-
-def in_another_process(function: Callable[..., T], *arguments: Any) -> T:
-    """Run a function in another process: it starts JAX, and Ray forks this one. A stop ends that process.
-
-    Raises:
-        Failure: that process died, or cannot be started.
-    """
-    try:
-        pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"))
-    except OSError as error:
-        raise Failure(f"This command cannot share a lock with another process ({error}): it needs /dev/shm.") from error
-    with pool as process:
-        try:
-            # A terminal sends Ctrl-C to the child, too, which would print a traceback: it inherits this mask
-            before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-            try:
-                answer = process.submit(function, *arguments)
-            finally:
-                signal.pthread_sigmask(signal.SIG_SETMASK, before)
-            return answer.result()
-        except BrokenProcessPool as error:
-            raise Failure(
-                "A process of this command died, perhaps because memory ran out: free some, then run the same command "
-                "again."
-            ) from error
-        except KeyboardInterrupt:  # SIGTERM reaches only this process
-            for child in multiprocessing.active_children():
-                child.terminate()
-            raise

@@ -20,8 +20,9 @@ from levelproof.pipeline.jobs.log import logged, require_library
 from levelproof.pipeline.jobs.progress import Board, Tally
 from levelproof.pipeline.jobs.schedule import Scheduler, UnitOutcome, WorkUnit, levels_text, schedule
 from levelproof.pipeline.jobs.seal import Sealer, sealing
+from levelproof.pipeline.processes import in_another_process
 from levelproof.pipeline.read.level_files import Listing, levels_below
-from levelproof.pipeline.runtime import cache_folder, in_another_process, own_cores, prepare_jax
+from levelproof.pipeline.runtime import cache_folder, own_cores, prepare_jax
 from levelproof.pipeline.stopping import Stop, stoppable
 from levelproof.pipeline.store import quarantine
 from levelproof.pipeline.store.checkpoints import require_same_experts

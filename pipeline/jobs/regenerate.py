@@ -12,8 +12,9 @@ from levelproof.configs.schema import from_files, other_sampler
 from levelproof.experts.procedure import Procedure
 from levelproof.pipeline.errors import Exit, UserError
 from levelproof.pipeline.jobs.generate import generate
+from levelproof.pipeline.processes import in_another_process
 from levelproof.pipeline.read.select import columns_in, select
-from levelproof.pipeline.runtime import in_another_process, prepare_jax
+from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store.manifest import require_manifest
 from levelproof.pipeline.store.origins import Origin, origins_of

@@ -15,8 +15,9 @@ from levelproof.configs.numbers import parse_count
 from levelproof.configs.schema import JobConfig, from_files, hash_of
 from levelproof.pipeline.errors import Exit, Failure, UserError
 from levelproof.pipeline.jobs.generate import generate
+from levelproof.pipeline.processes import in_another_process
 from levelproof.pipeline.read.levels import recorded_settings
-from levelproof.pipeline.runtime import in_another_process, own_cores
+from levelproof.pipeline.runtime import own_cores
 from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store.job_note import note_job, sound_note
 from levelproof.pipeline.store.layout import EXPERTS, data_paths, fragment_files

@@ -7,14 +7,13 @@ must match its row's content hash, and its witness must reach the goal.
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 from os import DirEntry
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -27,8 +26,9 @@ from levelproof.pipeline.errors import Exit, Failure
 from levelproof.pipeline.read.level_files import level_at
 from levelproof.pipeline.read.levels import recorded_settings
 from levelproof.pipeline.runtime import prepare_jax
-from levelproof.pipeline.store.bounds import DAMAGE, MAX_ROWS, DataUnread, bounded, unread
-from levelproof.pipeline.store.checksums import digests_of, has_own
+from levelproof.pipeline.stopping import stoppable
+from levelproof.pipeline.store.bounds import MAX_ROWS, unread
+from levelproof.pipeline.store.checksums import digests_of
 from levelproof.pipeline.store.job_note import JobNote, sound_note
 from levelproof.pipeline.store.layout import (
     BEGUN,
@@ -58,31 +58,22 @@ from levelproof.pipeline.store.manifest import (
 from levelproof.pipeline.store.named import open_shard
 from levelproof.pipeline.store.origins import RECORD, origin_of
 from levelproof.pipeline.store.progress_bar import ProgressBar, say
-from levelproof.pipeline.store.remote import is_listed, is_remote, stale_index
+from levelproof.pipeline.store.remote import is_remote
 from levelproof.pipeline.store.runs import runs, runs_text, without
 from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.store.shard import Shard
 from levelproof.pipeline.urls import quoted
-from levelproof.pipeline.verify.evidence import COLUMNS, Evidence, Recipe, same_stack
+from levelproof.pipeline.verify.cores import BLOCK, Device, Map, on_cores
+from levelproof.pipeline.verify.evidence import Evidence, Recipe, same_stack
 from levelproof.pipeline.verify.findings import Findings, why_not_repaired
+from levelproof.pipeline.verify.fragments import FragmentGroup, Part, grouped, rows_in
 from levelproof.pipeline.verify.seeds import examine_seeds
 
-GROUP_ROWS = 4 * CHUNK  # minimum number of rows per group of fragments
+GROUP_ROWS = 2 * BLOCK  # minimum number of rows per group of fragments, for each process
 ROUNDS = 20  # maximum number of examinations, if fragments are sealed concurrently; each examines only new ones
 
-Part = tuple[Fragment, pa.Table]  # a fragment and its rows
 
-
-@dataclass
-class FragmentGroup:
-    """Fragments that are examined together."""
-
-    files: list[tuple[Path, int]] = field(default_factory=list)  # as in `layout.fragment_files`
-    ids: list[np.ndarray] = field(default_factory=list)  # of the levels of sound fragments
-    named: set[str] = field(default_factory=set)  # shards and experts that sound fragments name
-    findings: Findings = field(default_factory=Findings)
-
-
+@stoppable()
 def verify(split: Path, as_json: bool, console: Console) -> Exit:
     """Verify `split`, print what is wrong, and return FAILED if anything is.
 
@@ -101,9 +92,7 @@ def verify(split: Path, as_json: bool, console: Console) -> Exit:
     return Exit.FAILED if findings.wrong else Exit.DONE
 
 
-def examine(
-    split: Path, console: Console | None = None, device: Literal["cpu", "gpu"] | None = None, threads: int = 1
-) -> Findings:
+def examine(split: Path, console: Console | None = None, device: Device = None, threads: int = 1) -> Findings:
     """Check every file, row and shard of a split; show progress on `console`. `device` and `threads`: of `prepare_jax`.
 
     Raises:
@@ -111,10 +100,10 @@ def examine(
     """
     prepare_jax(device=device, threads=threads)
     if is_seed(split):
-        return examine_seeds(split, console)
+        return examine_seeds(split, console, device)
     groups: list[FragmentGroup] = []
     for _ in range(ROUNDS):
-        groups = _examined(split, groups, console)
+        groups = _examined(split, groups, console, device)
         findings = _summed(split, groups, console)
         if not findings.wrong or fragment_files(split) == findings.examined:
             return findings
@@ -122,7 +111,9 @@ def examine(
     return _summed(split, [group for group in groups if there.issuperset(group.files)], console, complete=False)
 
 
-def _examined(split: Path, before: Sequence[FragmentGroup], console: Console | None) -> list[FragmentGroup]:
+def _examined(
+    split: Path, before: Sequence[FragmentGroup], console: Console | None, device: Device
+) -> list[FragmentGroup]:
     """Examine the fragments that no group of `before` has; return the groups whose fragments are all still there.
 
     A seal, or another command, replaces fragments, and then removes what they alone name. So what is missing in a group
@@ -133,8 +124,9 @@ def _examined(split: Path, before: Sequence[FragmentGroup], console: Console | N
     new = sorted(there.difference(*(group.files for group in groups)))
     recipe: Recipe | None = None
     config = next((group.findings.config for group in groups if group.findings.config), None)
-    with ProgressBar("levels", sum(_rows_in(path) for path, _ in new), console) as progress:
-        for group, parts in _groups(new):
+    count = sum(rows_in(path) for path, _ in new)
+    with ProgressBar("levels", count, console) as progress, on_cores(count, device) as cores:
+        for group, parts in grouped(new, cores.processes * GROUP_ROWS):
             groups.append(group)
             if not parts:
                 continue
@@ -144,7 +136,7 @@ def _examined(split: Path, before: Sequence[FragmentGroup], console: Console | N
             findings.budget = parts[0][1].column("budget")[0].as_py()
             findings.stored = min(first.densities, default="")
             _require_one_configuration(split, parts, config)
-            _check_fragments(parts, recipe, findings, progress)
+            _check_fragments(parts, recipe, findings, cores.map, progress)
             group.ids.append(np.concatenate([rows.column("level_id").to_numpy() for _, rows in parts]))
             group.named.update(name for fragment, _ in parts for name in fragment.digests)
     return groups
@@ -196,53 +188,6 @@ def _check_index(split: Path, findings: Findings) -> None:
             findings.add(f"The index {path} differs from the fragments there: `levelproof seal` writes it anew.", [])
 
 
-def _rows_in(path: Path) -> int:
-    with suppress(*DAMAGE), bounded(path) as file:
-        return file.rows
-    return 0
-
-
-def _groups(files: Sequence[tuple[Path, int]]) -> Iterator[tuple[FragmentGroup, list[Part]]]:
-    """Yield fragments in groups of about GROUP_ROWS rows, damaged ones with their reasons, and the sound ones' rows.
-
-    Raises:
-        DataUnread: a fragment cannot be read, so that nothing is known about it.
-    """
-    group, parts = FragmentGroup(), list[Part]()
-    for file in files:
-        group.files.append(file)
-        try:
-            part = _part(file[0])
-            parts += [part] if part[0].rows else []  # empty ones are fences
-        except DataUnread:
-            raise
-        except Failure as failure:
-            group.findings.fragments[file[0]] = str(failure)
-        if sum(rows.num_rows for _, rows in parts) >= GROUP_ROWS or file == files[-1]:
-            yield group, parts
-            group, parts = FragmentGroup(), []
-
-
-def _part(path: Path) -> Part:
-    """Read a fragment, after its checksum: parsing a damaged one can crash the process.
-
-    Raises:
-        DataUnread: this machine cannot read it, or it has another version.
-        Failure: it is damaged or missing.
-    """
-    try:
-        if not has_own(path):
-            raise Failure(f"The fragment {path} is not what was committed: its bytes have changed.")
-        fragment, rows = read_fragment(path, ["level_id", *COLUMNS])
-    except (OSError, MemoryError) as error:
-        if isinstance(error, FileNotFoundError) and not is_listed(path):
-            raise DataUnread(stale_index(path)) from None
-        if machines := unread(path, error):
-            raise machines from None
-        raise Failure(f"The fragment {path} is missing or damaged ({type(error).__name__}).") from None
-    return fragment, rows
-
-
 def _recipe(split: Path, fragment: Fragment) -> Recipe:
     """Return how to make and play the levels. Raise Failure if this version cannot."""
     config = fragment.config
@@ -263,7 +208,9 @@ def _require_one_configuration(split: Path, parts: Sequence[Part], config: dict[
             )
 
 
-def _check_fragments(parts: Sequence[Part], recipe: Recipe, findings: Findings, progress: ProgressBar) -> None:
+def _check_fragments(
+    parts: Sequence[Part], recipe: Recipe, findings: Findings, run: Map, progress: ProgressBar
+) -> None:
     """Check the rows of some sound fragments, and the shards and experts that they name."""
     rows = pa.concat_tables([rows for _, rows in parts])
     digests = {name: files for fragment, _ in parts for name, files in fragment.digests.items()}
@@ -271,10 +218,13 @@ def _check_fragments(parts: Sequence[Part], recipe: Recipe, findings: Findings, 
     changed = {name: _changed_files(recipe.split, name, digests.get(name, {})) for name in [*in_shards, *in_experts]}
     shards = {name: _opened(name, recipe, ids, findings, bool(changed[name])) for name, ids in in_shards.items()}
     findings.changed |= {name for name, files in changed.items() if files}
-    for first in range(0, rows.num_rows, CHUNK):
-        block = rows.slice(first, CHUNK)
-        Evidence(block, recipe, shards, findings).examine()
-        progress.advance(block.num_rows)
+    blocks = [rows.slice(first, BLOCK) for first in range(0, rows.num_rows, BLOCK)]
+    named = (
+        {name: shards[name] for name in block.column("shard").unique().drop_null().to_pylist()} for block in blocks
+    )
+    for found in run(partial(_examined_block, recipe, findings.changed), blocks, named):
+        findings.include(found)
+        progress.advance(found.levels)
     for name, level_ids in {**in_shards, **in_experts}.items():
         if not changed[name] or shards.get(name, "") is None:  # sound, or already reported
             continue
@@ -286,6 +236,14 @@ def _check_fragments(parts: Sequence[Part], recipe: Recipe, findings: Findings, 
             findings.wrong[wrong] = level_ids
     _note_losses(rows, recipe, findings)
     _keep_commands(parts, findings)
+
+
+def _examined_block(recipe: Recipe, changed: set[str], rows: pa.Table, shards: dict[str, Shard | None]) -> Findings:
+    """Examine rows, perhaps in another process; `changed`: as in `Findings`, so far."""
+    findings = Findings(changed={*changed})
+    for first in range(0, rows.num_rows, CHUNK):
+        Evidence(rows.slice(first, CHUNK), recipe, shards, findings).examine()
+    return findings
 
 
 def _levels_by_name(rows: pa.Table, column: str) -> dict[str, set[int]]:

@@ -1,7 +1,6 @@
 """JAX in a worker: one thread, no deadlock, cached programs."""
 
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -9,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from levelproof.pipeline import runtime
-from levelproof.pipeline.errors import Failure
-from levelproof.pipeline.runtime import CACHE_VARIABLE, XLA_FLAGS, cache_folder, in_another_process, own_cores
+from levelproof.pipeline.runtime import CACHE_VARIABLE, XLA_FLAGS, cache_folder, own_cores
 from tests.pace import patience
 from tests.pipeline.command import ROOT, line_of
 
@@ -42,21 +40,6 @@ def python(program: str, folder: Path, **environment: str) -> str:
         command, env=inherited | ours, capture_output=True, text=True, timeout=patience(120), check=True
     )
     return done.stdout
-
-
-def interrupted() -> str:
-    os.kill(os.getpid(), signal.SIGINT)  # as a terminal does to all processes of a command
-    return "alive"
-
-
-def test_another_process_leaves_ctrl_c_to_its_command() -> None:
-    assert in_another_process(interrupted) == "alive"
-    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
-
-
-def test_another_process_that_dies_is_reported() -> None:
-    with pytest.raises(Failure, match="A process of this command died"):
-        in_another_process(os.abort)
 
 
 @pytest.mark.slow

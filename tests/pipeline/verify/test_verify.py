@@ -19,6 +19,7 @@ from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
 from levelproof.levelgen.level import Level
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.pipeline.errors import Failure, StoreFailure
+from levelproof.pipeline.exchange.seed import export_seed
 from levelproof.pipeline.jobs import repair as repairing
 from levelproof.pipeline.store import fragment, remote, requests
 from levelproof.pipeline.store import shard as shards
@@ -30,7 +31,8 @@ from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, wr
 from levelproof.pipeline.store.remote import INDEX
 from levelproof.pipeline.store.seal import Piece, seal
 from levelproof.pipeline.store.shard import Shard, write_shard
-from levelproof.pipeline.verify import evidence
+from levelproof.pipeline.verify import cores, evidence, fragments
+from levelproof.pipeline.verify import seeds as seed_files
 from levelproof.pipeline.verify import verify as verifying
 from levelproof.pipeline.verify.findings import Findings
 from levelproof.pipeline.verify.verify import examine
@@ -99,6 +101,30 @@ def test_examine_checks_a_split_on_a_web_server(split: Path, tmp_path: Path, mon
         assert f"{shard.name}/zarr.json is not what was committed" in sentence
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["split", "seeds", "web server"])
+def test_examine_in_several_processes_finds_the_same(
+    kind: str, split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A split has two rows that lie, and a shard whose bytes have changed."""
+    seeds, solved = tmp_path / "levels.parquet", rows_labelled(split, Label.SOLVED)
+    export_seed(split, None, seeds)
+    liars, other = [solved[0]["level_id"], solved[1]["level_id"]], split / solved[-1]["shard"] / "zarr.json"
+    forge(split, lambda row: row.update(steps_to_goal=256), liars)
+    other.write_bytes(other.read_bytes() + b" ")
+    write_index(split)
+    with serving(files_of(split.parent)) as server:
+        path = {"split": split, "seeds": seeds, "web server": Path(f"{server.url}/{split.name}")}[kind]
+        alone = examine(path)
+        monkeypatch.setattr(cores, "LEAST", 1)
+        monkeypatch.setattr(cores, "own_cores", lambda: range(3))
+        monkeypatch.setattr(verifying, "BLOCK", UNIT)
+        monkeypatch.setattr(seed_files, "READ", UNIT)
+        assert examine(path) == alone
+    assert alone.levels == UNIT * UNITS
+    assert len(alone.sentences) == (0 if kind == "seeds" else 3)
+
+
 def test_examine_compares_the_index_for_web_servers_with_the_fragments(split: Path) -> None:
     write_index(split)
     index = split / MANIFEST / INDEX
@@ -138,7 +164,7 @@ def test_examine_finds_nothing_wrong_in_a_split_that_is_sealed_meanwhile(
     split: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At each look, a run merges two fragments after they were listed and before they are read."""
-    groups, sealed = verifying._groups, list[Path]()
+    groups, sealed = verifying.grouped, list[Path]()
 
     def merging(*listed: Any) -> Iterator[Any]:
         pieces = list(map(Piece.of, read_manifest(split, []).fragments))
@@ -147,7 +173,7 @@ def test_examine_finds_nothing_wrong_in_a_split_that_is_sealed_meanwhile(
 
     levels = read_manifest(split, []).level_ids.tolist()
     monkeypatch.setattr(verifying, "GROUP_ROWS", 1)
-    monkeypatch.setattr(verifying, "_groups", merging)
+    monkeypatch.setattr(verifying, "grouped", merging)
     with only_writer(split, print):
         findings = examine(split)
     assert findings.sentences == []
@@ -306,7 +332,7 @@ def test_repair_removes_nothing_that_it_cannot_read(
         read = Path.read_bytes
         monkeypatch.setattr(Path, "read_bytes", lambda path: failing() if path.name == JOB else read(path))
     else:
-        monkeypatch.setattr(verifying, step, failing)
+        monkeypatch.setattr(fragments if step == "has_own" else verifying, step, failing)
     done = here(["verify", str(split), "--repair", "executor=inline"], split.parent)
     assert_refused(done, 1, str(split), "run the same command again" if step != "read_fragment" else "")
     assert {path: path.stat().st_ino for path in split.rglob("*")} == before
