@@ -146,17 +146,18 @@ def train(
             rate, speed = pace.count(1), ""
             if rate:
                 speed = f" · {rate * config.train.batch:,.0f} samples/s · about {duration((last - update) / rate)} left"
-            words = f"{update:,}/{last:,} updates{speed}"
-            keep = update % config.interval == 0 or update == last or run.stop.is_set()
-            if keep:
+            words, stops = f"{update:,}/{last:,} updates{speed}", run.stop.is_set()
+            if keep := update % config.interval == 0 or update == last or stops:
                 with pace.aside():
                     numbers = {COURSE.step: update, "bc/samples_per_second": rate * config.train.batch or np.nan}
-                    numbers |= averages("", recent) | validated(state, held, config)
+                    numbers |= averages("", recent)
+                    if not stops:  # validation may take longer than is left
+                        numbers |= validated(state, held, config)
+                        words = f"{line_of(update, last, numbers)}{speed}"
                     recent = []
                     run.keep(state, numbers, "bc/loss", "train.learning_rate")
-                words = f"{line_of(update, last, numbers)}{speed}"
             bar.show(update, words, keep=keep)
-            if keep and run.stop.is_set():
+            if stops:
                 break
     return state
 

@@ -181,8 +181,8 @@ def update_until_done(
                 words += f" · {solved:.1%} solved"
             if rate:
                 words += f" · {rate:,.0f} env steps/s · about {duration((last - update) * per_update / rate)} left"
-            keep = update % interval == 0 or update == last or run.stop.is_set()
-            if keep:
+            stops = run.stop.is_set()
+            if keep := update % interval == 0 or update == last or stops:
                 with pace.aside():
                     numbers = {COURSE.step: update * per_update, "train/updates": update} | averages(recent)
                     numbers |= recipe.curriculum.facts(learner.curriculum)
@@ -190,7 +190,7 @@ def update_until_done(
                     recent = []
                     run.keep(learner, numbers, "loss/value", "ppo.learning_rate")
             bar.show(update, words, keep=keep)
-            if keep and run.stop.is_set():
+            if stops:
                 break
     return learner
 
