@@ -1,22 +1,23 @@
 """Other processes for a command's work: to use more cores, or because this process must not have started JAX."""
 
 import multiprocessing
+import operator
 import os
 import signal
-import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import cache, partial
+from multiprocessing import util
 from typing import Any, TypeVar
 
 from levelproof.pipeline.errors import Failure
 
 GRACE = 3.0  # s for which a process may go on that was told to end: compiled code cannot be interrupted
 
-ENDING = threading.Event()  # set in a process that was told to end
 
 T = TypeVar("T")
 
@@ -45,33 +46,29 @@ def other_processes(count: int, *prepare: Any) -> Iterator[Callable[..., Iterato
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
+    others = set(multiprocessing.active_children())
     with pool:
         try:
             yield run
         except BrokenProcessPool as error:
+            _end(others)
             raise Failure(
                 "A process of this command died, perhaps because memory ran out: free some, then run the same command "
                 "again."
             ) from error
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
-            _end(multiprocessing.active_children())
+            _end(others)
             raise
 
 
 def in_another_process(function: Callable[..., T], *arguments: Any) -> T:
     """Run a function in another process: it starts JAX, and Ray forks this one. Raises as `other_processes`."""
     with other_processes(1) as run:
-        return next(run(_called, [partial(function, *arguments)]))
-
-
-def _called(work: Callable[[], T]) -> T:
-    return work()
+        return next(run(operator.call, [partial(function, *arguments)]))
 
 
 def _prepared(prepare: tuple[Any, ...], function: Callable[..., T], *item: Any) -> T:
-    if ENDING.is_set():
-        sys.exit()  # the pool answers with it, and asks for the next item
     if prepare:
         _once(*prepare)
     return function(*item)
@@ -83,17 +80,30 @@ def _once(function: Callable[..., None], *arguments: Any) -> None:
 
 
 def _follow_parent() -> None:
-    """Let this process end as soon as its parent tells it to, after its libraries' cleanup, or dies."""
-    signal.signal(signal.SIGTERM, lambda *_: (ENDING.set(), sys.exit()))
+    """Let this process end as soon as SIGTERM comes or its parent dies.
+
+    SIGTERM itself would end it without the finalizers of its libraries' locks, and the parent would warn of leaks.
+    SystemExit would not end it: the pool returns that as the result of a call.
+    """
+    signal.signal(signal.SIGTERM, _leave)
     if parent := multiprocessing.parent_process():
         threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
 
 
-def _end(children: list[Any]) -> None:
-    """End processes, by force if they do not obey."""
-    for child in children:
-        child.terminate()
-    for child in children:
-        child.join(GRACE)
-        if child.is_alive():
-            child.kill()
+def _leave(*_: object) -> None:
+    util._run_finalizers()  # pyright: ignore[reportAttributeAccessIssue]
+    os._exit(128 + signal.SIGTERM)
+
+
+def _end(others: set[Any]) -> None:
+    """End this process's children except `others`: by force after GRACE, or once this process is stopped again."""
+    children, end = set(multiprocessing.active_children()) - others, time.monotonic() + GRACE
+    try:
+        for child in children:
+            child.terminate()
+        for child in children:
+            child.join(max(end - time.monotonic(), 0))
+    finally:
+        for child in children:
+            if child.is_alive():
+                child.kill()

@@ -218,7 +218,8 @@ def _check_fragments(
     changed = {name: _changed_files(recipe.split, name, digests.get(name, {})) for name in [*in_shards, *in_experts]}
     shards = {name: _opened(name, recipe, ids, findings, bool(changed[name])) for name, ids in in_shards.items()}
     findings.changed |= {name for name, files in changed.items() if files}
-    blocks = [rows.slice(first, BLOCK) for first in range(0, rows.num_rows, BLOCK)]
+    at = np.arange(rows.num_rows)
+    blocks = [rows.take(at[first : first + BLOCK]) for first in range(0, len(at), BLOCK)]  # slices pickle as the whole
     named = (
         {name: shards[name] for name in block.column("shard").unique().drop_null().to_pylist()} for block in blocks
     )

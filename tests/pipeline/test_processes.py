@@ -60,11 +60,32 @@ def test_results_come_in_order_from_prepared_processes() -> None:
     assert not multiprocessing.active_children()
 
 
-def test_error_of_a_process_ends_all() -> None:
-    with other_processes(2) as run, pytest.raises(UserError, match="3 is too much: choose less"):
+def fail_beside_others() -> None:
+    with other_processes(2) as run:
+        run(time.sleep, [LONG])
         list(run(partial(refused_at, 3), range(1000)))
+
+
+def test_error_of_a_process_ends_those_at_work() -> None:
+    with pytest.raises(UserError, match="3 is too much: choose less"):
+        fail_beside_others()
     assert not multiprocessing.active_children()
-    assert not multiprocessing.active_children()
+
+
+def lose_one(number: signal.Signals) -> None:
+    with other_processes(2) as run:
+        list(run(time.sleep, [0.5] * 4))  # both have begun
+        answers = run(time.sleep, [LONG] * 9)
+        os.kill(multiprocessing.active_children()[0].pid or 0, number)
+        list(answers)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_death_of_one_process_ends_those_at_work_and_is_reported(number: signal.Signals) -> None:
+    """As where memory runs out: a pool alone would wait for the others."""
+    with pytest.raises(Failure, match="A process of this command died"):
+        lose_one(number)
+    wait_until(lambda: not multiprocessing.active_children(), 20)
 
 
 def stopped() -> None:
