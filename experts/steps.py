@@ -1,4 +1,4 @@
-"""Env steps and seconds by purpose. Imports no JAX, because the driver receives them to show progress."""
+"""Progress, and env steps and seconds by purpose. Imports no JAX, because the driver receives them to show progress."""
 
 from typing import NamedTuple
 
@@ -16,6 +16,14 @@ class EnvSteps(NamedTuple):
     def shown(self) -> int:
         """Env steps that a progress bar counts."""
         return self.searched + self.trained + self.replayed
+
+
+class Totals(NamedTuple):
+    """Progress of some levels."""
+
+    env_steps: int = 0
+    levels: float = 0.0  # decided; a level in training counts as the share of its budget used
+    solved: int = 0
 
 
 class Seconds(NamedTuple):

@@ -21,7 +21,7 @@ from levelproof.levelgen.task.observe.flat import (
     polygon_rows,
     thruster_rows,
 )
-from levelproof.physics.types import FIXED_POLYGONS, Size, State
+from levelproof.physics.types import FIXED_POLYGONS, State
 
 GOALS = (Role.GREEN, Role.BLUE, Role.RED)
 
@@ -67,7 +67,7 @@ def entity_tables(level: Level, state: State) -> EntityTables:
     return EntityTables(
         tuple(_finished(table, model.gravity[1] / GRAVITY_UNIT) for table in tables),
         jnp.concatenate([model.active[np.r_[polygons, circles]], model.joint_active, model.thruster_active]),
-        _links(size, np.r_[polygons, circles], a + b, hull),
+        _links(np.r_[polygons, circles], a + b, hull),
         free[:, None] * _one_hot(bound, MOTOR_BINDINGS),
         model.thruster_active[:, None] * _one_hot(level.thruster_binding, THRUSTER_BINDINGS),
     )
@@ -121,7 +121,7 @@ def _fixed(bodies: Placed, at: Float[Array, "entity body lane"], local: Array, t
 
 
 def _links(
-    size: Size, kept: np.ndarray, ends: Float[Array, "joint body lane"], hull: Float[Array, "thruster body lane"]
+    kept: np.ndarray, ends: Float[Array, "joint body lane"], hull: Float[Array, "thruster body lane"]
 ) -> Bool[Array, "token token lane"]:
     fixed = jnp.concatenate([ends, hull])[:, kept] > 0  # [actuator, kept body, lane]
     count, bodies = fixed.shape[0], len(kept)

@@ -7,7 +7,7 @@ alone, so sharing changes no result.
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from types import MappingProxyType
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -21,6 +21,7 @@ from levelproof.experts.pool.found import SearchFindings, nothing_found, row_of
 from levelproof.experts.pool.paused import Paused
 from levelproof.experts.procedure import Procedure
 from levelproof.experts.search.search import Searching
+from levelproof.experts.steps import Totals
 from levelproof.experts.training.advance import advance, train_on
 from levelproof.experts.training.slots import ExpertState, Mode, Pending, Report, Slots, begin, slots_of
 from levelproof.experts.training.stop import rules_of
@@ -43,14 +44,6 @@ IN_CACHE = 128  # lanes: their physics and one minibatch fit the cache of a core
 T = TypeVar("T")
 NOTHING_BEGUN: Mapping[int, KeptExpert] = MappingProxyType({})
 NONE_PAUSED: Mapping[int, Paused] = MappingProxyType({})
-
-
-class Totals(NamedTuple):
-    """Progress of some levels."""
-
-    env_steps: int  # of training
-    levels: float  # decided; a level in training counts as the share of its budget used
-    solved: int
 
 
 class TrainingJob(Submission):

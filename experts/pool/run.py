@@ -12,9 +12,9 @@ from levelproof.experts.labels import WITNESSED, Source, Verdict
 from levelproof.experts.ledger import Lap, Ledger, lap
 from levelproof.experts.pool.found import SearchFindings, findings_of, joined
 from levelproof.experts.pool.paused import Paused
-from levelproof.experts.pool.pool import NONE_PAUSED, NOTHING_BEGUN, Pool, Totals, TrainingJob
+from levelproof.experts.pool.pool import NONE_PAUSED, NOTHING_BEGUN, Pool, TrainingJob
 from levelproof.experts.pool.rework import rework
-from levelproof.experts.steps import EnvSteps
+from levelproof.experts.steps import EnvSteps, Totals
 from levelproof.experts.verdict.afresh import attempt
 from levelproof.experts.verdict.before import decide
 from levelproof.experts.verdict.judge import KeptExpert, TrainedLevel, Witness, judge, repeating

@@ -57,8 +57,6 @@ def run(arguments: argparse.Namespace) -> None:
     from levelproof.pipeline.learn.evaluate import evaluate, is_named
     from levelproof.pipeline.urls import require_known
 
-    for split in arguments.experts:
-        require_known(split)
     if is_named(arguments.on):
         if arguments.where is not None:
             raise UserError("--where selects levels of a split: name one with --on.")

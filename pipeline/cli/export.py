@@ -1,7 +1,6 @@
 """`levelproof export`: write a level or a split for other programs."""
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 
 from levelproof.pipeline.cli.command import add_split
@@ -19,48 +18,12 @@ levelproof export data/128k/s --format seed -o s.parquet    14 to 37 bytes per s
 levelproof export manifests/256k/s-handmade --format seed --levels handmade -o handmade.parquet"""
 JSON = "json"  # for one level; the other formats take a split
 LEVEL = Path("level.json")  # its default
+FORMATS = ("kinetix", "minari", "parquet", "seed")
+ACTIONS = ("multi_discrete", "combined", "continuous")  # values of ActionKind, whose module is slow to import
 WHERE = (
     "only levels that meet this condition on the manifest's columns "
     "(default: label = 'solved'; for parquet and seed, all levels)"
 )
-
-
-def _kinetix(split: Path, where: str | None, out: Path) -> None:
-    from levelproof.pipeline.exchange.kinetix import export_kinetix
-
-    export_kinetix(split, where, out)
-
-
-def _parquet(split: Path, where: str | None, out: Path) -> None:
-    from levelproof.pipeline.exchange.parquet import export_parquet
-
-    export_parquet(split, where, out)
-
-
-def _seed(split: Path, where: str | None, out: Path, levels: str | None = None, with_levels: bool = True) -> None:
-    if levels is not None:
-        if where or not with_levels:
-            raise UserError("--levels adds the levels to a whole seed file: leave out --where and --without-levels.")
-        from levelproof.pipeline.exchange.levels_elsewhere import add_levels
-        from levelproof.pipeline.learn.published import HANDMADE, handmade_folder
-
-        add_levels(split, handmade_folder() if levels == HANDMADE else Path(levels), out)
-        return
-    from levelproof.pipeline.exchange.seed import export_seed
-
-    export_seed(split, where, out, with_levels)
-
-
-def _minari(split: Path, where: str | None, out: Path, actions: str = "multi_discrete") -> None:
-    from levelproof.pipeline.exchange.minari.episodes import ActionKind
-    from levelproof.pipeline.exchange.minari.export import export_minari
-
-    export_minari(split, where, out, ActionKind(actions))
-
-
-# Write the levels of a split that meet a condition (None: the format's default) to a new folder or file
-FORMATS: dict[str, Callable[..., None]] = {"kinetix": _kinetix, "minari": _minari, "parquet": _parquet, "seed": _seed}
-ACTIONS = ("multi_discrete", "combined", "continuous")  # values of ActionKind, whose module is slow to import
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -108,7 +71,33 @@ def run(arguments: argparse.Namespace) -> None:
     if out is None:
         kind, name = ("file", "levels.parquet") if arguments.format == "seed" else ("folder", arguments.format)
         raise UserError(f"No output path: name the {kind} to write with -o, as in -o {name}.")
-    more = [arguments.actions] if arguments.actions else []
-    if arguments.format == "seed":
-        more = [arguments.levels, not arguments.without_levels]
-    FORMATS[arguments.format](split, where, out, *more)
+    match arguments.format:
+        case "kinetix":
+            from levelproof.pipeline.exchange.kinetix import export_kinetix
+
+            export_kinetix(split, where, out)
+        case "minari":
+            from levelproof.pipeline.exchange.minari.episodes import ActionKind
+            from levelproof.pipeline.exchange.minari.export import export_minari
+
+            export_minari(split, where, out, ActionKind(arguments.actions or ACTIONS[0]))
+        case "parquet":
+            from levelproof.pipeline.exchange.parquet import export_parquet
+
+            export_parquet(split, where, out)
+        case "seed":
+            _export_seed(split, where, out, arguments.levels, not arguments.without_levels)
+
+
+def _export_seed(split: Path, where: str | None, out: Path, levels: str | None, with_levels: bool) -> None:
+    if levels is None:
+        from levelproof.pipeline.exchange.seed import export_seed
+
+        export_seed(split, where, out, with_levels)
+        return
+    if where or not with_levels:
+        raise UserError("--levels adds the levels to a whole seed file: leave out --where and --without-levels.")
+    from levelproof.pipeline.exchange.levels_elsewhere import add_levels
+    from levelproof.pipeline.learn.published import HANDMADE, handmade_folder
+
+    add_levels(split, handmade_folder() if levels == HANDMADE else Path(levels), out)

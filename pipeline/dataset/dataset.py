@@ -117,7 +117,7 @@ class Dataset:
     @property
     def content_hashes(self) -> list[str]:
         """Content hashes of the trajectories' levels; of seeds, made from the levels at the first call."""
-        return self._trajectories.content_hashes
+        return self._trajectories.hashes.to_pylist()
 
     @property
     def differing(self) -> Int[np.ndarray, " level"]:

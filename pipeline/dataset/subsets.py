@@ -19,10 +19,8 @@ def check_share(share: float) -> None:
         raise UserError(f"The share of validation is {share}: use a number from 0 to 1.")
 
 
-def in_subset(
-    content_hashes: Sequence[str] | pa.ChunkedArray, subset: str | None, share: float
-) -> Bool[np.ndarray, " level"]:
-    """Return which levels are in a subset (None: all); `share` of all hashes belong to validation.
+def in_subset(content_hashes: Sequence[str] | pa.ChunkedArray, subset: str, share: float) -> Bool[np.ndarray, " level"]:
+    """Return which levels are in a subset; `share` of all hashes belong to validation.
 
     Depends only on the level's hash and the share. A larger share keeps all levels that are already in validation.
 
@@ -30,8 +28,6 @@ def in_subset(
         UserError: the subset does not exist.
         Failure: a hash is invalid.
     """
-    if subset is None:
-        return np.ones(len(content_hashes), bool)
     if subset not in SUBSETS:
         raise UserError(f"There is no subset {subset!r}: choose {' or '.join(SUBSETS)}, or None for both.")
     # In Arrow, because millions of Python strings take gigabytes

@@ -87,11 +87,6 @@ class TrajectoryRows:
             digest.update(self.table[name].fill_null(0).to_numpy().tobytes())
         return digest.hexdigest()[:16]
 
-    @property
-    def content_hashes(self) -> list[str]:
-        """Content hashes of the levels; of seeds, made from the levels once on a machine."""
-        return self.hashes.to_pylist()
-
     @cached_property
     def hashes(self) -> pa.ChunkedArray:
         """Content hashes as a column of Arrow, of which millions take little memory."""

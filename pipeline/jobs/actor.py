@@ -31,7 +31,7 @@ class WorkerActor:
         prepare_jax(own_core(neighbours), job.device)
         # These modules read JAX's settings on import, so import them after JAX is set up
         from levelproof.pipeline.jobs.ahead import Ahead
-        from levelproof.pipeline.jobs.workers import worker_for
+        from levelproof.pipeline.jobs.worker import worker_for
 
         spare_imports()
         serve(split, writer)

@@ -17,7 +17,7 @@ from levelproof.pipeline.store.manifest import read_manifest, require_manifest
 from levelproof.pipeline.store.progress_bar import say
 from levelproof.pipeline.store.remote import absolute, as_typed
 from levelproof.pipeline.store.seed.columns import ROW_GROUP
-from levelproof.pipeline.store.seed.file import is_seed, read_seed, seed_files
+from levelproof.pipeline.store.seed.file import describe_seed, is_seed, read_seed, seed_files
 from levelproof.pipeline.store.seed.source import LevelSource, without_levels
 from levelproof.pipeline.store.seed.write import content_digest
 from levelproof.pipeline.words import many
@@ -74,7 +74,7 @@ def _require_levels(source: Path, config: dict) -> None:
 def _job(source: Path, out: Path, settings: Sequence[str], config: dict) -> GrowConfig:
     """Return the job that grows seed files into `out`."""
     first = seed_files(source)[0]
-    about, _ = read_seed(first, [])
+    about = describe_seed(first)
     known = LevelSource.of(config, first)
     size, budget = config["size"], about.budget
     path = out.absolute()

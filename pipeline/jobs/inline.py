@@ -35,7 +35,7 @@ def run(job: JobConfig, split: Path, scheduler: Scheduler, settle: Settle, board
         board.say(f"This process uses a CPU core, not a GPU: {NO_GPU}.")
     # These modules read JAX's settings on import, so import them after JAX is set up
     from levelproof.pipeline.jobs.ahead import Ahead
-    from levelproof.pipeline.jobs.workers import worker_for
+    from levelproof.pipeline.jobs.worker import worker_for
 
     spare_imports()
     with stop.heeded():

@@ -15,8 +15,8 @@ from levelproof.pipeline.store.remote import is_remote
 
 LIBRARIES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
 FOLDER, PROJECT = "log", "levelproof"
-# Kinds of env steps by the stage whose seconds they took
-STAGES = {"search": ("searched",), "training": ("trained",), "evaluation": ("evaluated",)}
+# Kind of env steps by the stage whose seconds they took
+STAGES = {"search": "searched", "training": "trained", "evaluation": "evaluated"}
 
 
 class ScalarWriter(Protocol):
@@ -123,9 +123,9 @@ def scalars(began: Event, state: Event) -> dict[str, float]:
         numbers["levels/solved_share"] = state["solved"] / done
     if state["rate"]:
         numbers["env_steps/per_second"] = state["rate"]
-    for stage, kinds in STAGES.items():
+    for stage, kind in STAGES.items():
         if seconds := state["seconds"][stage]:  # summed over workers, so this is the speed of one busy worker
-            numbers[f"env_steps/per_second_of_{stage}"] = sum(state["spent"][kind] for kind in kinds) / seconds
+            numbers[f"env_steps/per_second_of_{stage}"] = state["spent"][kind] / seconds
     return numbers
 
 

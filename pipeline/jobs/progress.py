@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
-from levelproof.experts.steps import NO_SECONDS, EnvSteps, Seconds
+from levelproof.experts.steps import NO_SECONDS, EnvSteps, Seconds, Totals
 from levelproof.pipeline.jobs.schedule import Round, Summary, WorkUnit
 from levelproof.pipeline.store.progress_bar import LINE_EVERY, TextBar, say
 from levelproof.pipeline.words import duration, many
@@ -27,7 +27,7 @@ class Tally:
     levels: int  # wanted
     done: int  # committed, including those of earlier runs
     solved: int
-    running: dict[WorkUnit, tuple[int, float, int]] = field(default_factory=dict)  # env steps, levels, solved
+    running: dict[WorkUnit, Totals] = field(default_factory=dict)
     spent: EnvSteps = field(default_factory=EnvSteps)  # env steps spent on this run's committed units
     seconds: Seconds = NO_SECONDS  # workers' time on the same units
     unsealed: int = 0  # groups of fragments that are left to seal after the last commit
@@ -55,21 +55,21 @@ class Tally:
     @property
     def steps(self) -> int:
         """Env steps of this run, committed or not."""
-        return self.spent.shown + sum(steps for steps, _, _ in self.running.values())
+        return self.spent.shown + sum(unit.env_steps for unit in self.running.values())
 
     @property
     def share(self) -> float:
         """Finished share of the job, 0 to 1; a running level counts by the share of its budget that it has used."""
-        return min(1.0, (self.done + sum(levels for _, levels, _ in self.running.values())) / self.levels)
+        return min(1.0, (self.done + sum(unit.levels for unit in self.running.values())) / self.levels)
 
     @property
     def decided(self) -> int:
         """Levels that are decided, committed or not; running ones count by their share of the budget, rounded down."""
-        return self.done + int(sum(levels for _, levels, _ in self.running.values()))
+        return self.done + int(sum(unit.levels for unit in self.running.values()))
 
     @property
     def solved_so_far(self) -> int:
-        return self.solved + sum(solved for _, _, solved in self.running.values())
+        return self.solved + sum(unit.solved for unit in self.running.values())
 
     def text(self, rate: float, left: float | None) -> str:
         """Describe the progress, at `rate` env steps/s and with `left` s to go (None: not known yet)."""

@@ -22,8 +22,7 @@ from levelproof.pipeline.store.seed.file import is_seed
 
 OWN = ("manifest", "where", "continue")  # arguments that are not settings of a job
 FIXED = ("size", "levels", "first_level", "level_files", "distribution")  # settings that the manifest decides
-# Groups of settings that each preset decides
-PRESETS = {"procedure": {field.name for field in fields(Procedure)}}
+OF_PROCEDURE = {field.name for field in fields(Procedure)}  # groups of settings that a procedure decides
 HINT = "as in levelproof regenerate manifest=data/256k/s budget=1M where=\"label = 'unsolved'\""
 
 
@@ -92,5 +91,5 @@ def split_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]
 def kept_settings(config: Mapping[str, Any], settings: Sequence[str]) -> list[str]:
     """Return the settings that the manifest was made with, without the groups that a preset in `settings` replaces."""
     named = {setting.partition("=")[0] for setting in settings}
-    replaced = set[str]().union(*(groups for preset, groups in PRESETS.items() if preset in named))
+    replaced = OF_PROCEDURE if "procedure" in named else set()
     return [setting for setting in changed_settings(config) if setting.partition(".")[0] not in replaced]

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from levelproof.experts.steps import NO_SECONDS, EnvSteps, Seconds
+from levelproof.experts.steps import NO_SECONDS, EnvSteps, Seconds, Totals
 from levelproof.pipeline.errors import Failure, LevelproofError
 from levelproof.pipeline.jobs.sizing import UnitSize
 from levelproof.pipeline.store.layout import unit_name
@@ -134,7 +134,7 @@ class Round:
     """A worker's report on one round."""
 
     outcomes: list[UnitOutcome]  # of the units that ended
-    totals: dict[WorkUnit, tuple[int, float, int]]  # of running units: env steps, levels, solved levels so far
+    totals: dict[WorkUnit, Totals]  # of running units, so far
     wants: int  # further levels for which it has room
     spare: int = 0  # unstarted levels
     cuts: list[Cut] = field(default_factory=list)  # units from which it has given levels back

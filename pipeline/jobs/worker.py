@@ -7,10 +7,11 @@ import time
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
-from levelproof.configs.schema import JobConfig
+from levelproof.configs.schema import GrowConfig, JobConfig
 from levelproof.experts.ledger import Lap
 from levelproof.experts.pool.run import TrainingRun
 from levelproof.pipeline.errors import LevelproofError, last_line
+from levelproof.pipeline.jobs.grower import Grower
 from levelproof.pipeline.jobs.schedule import Cut, Order, Round, UnitOutcome, WorkUnit
 from levelproof.pipeline.jobs.unit import begin_unit, failure, finish_unit, pool_for
 from levelproof.pipeline.store.paused import save_paused
@@ -44,11 +45,9 @@ class Worker:
         if self.stopping:
             return self.leave(outcomes, cuts)
         now = {unit: run.totals() for unit, run in self._runs.items()}
-        # Plain tuples, because the driver imports no JAX
-        plain = {unit: (run.env_steps, run.levels, run.solved) for unit, run in now.items()}
         wants = self.pool.wants(sum(run.searching for run in self._runs.values()))
         spare = sum(len(run.unbegun) for run in self._runs.values())
-        return Round(outcomes, plain, wants, spare, cuts, unsaved=self._unsaved)
+        return Round(outcomes, now, wants, spare, cuts, unsaved=self._unsaved)
 
     def leave(self, outcomes: Sequence[UnitOutcome] = (), cuts: Sequence[Cut] = ()) -> Round:
         """Commit the decided levels of all running units, and cut off the undecided ones."""
@@ -118,3 +117,8 @@ class Worker:
             return UnitOutcome(unit, finish_unit(self._job, self._split, unit, run))
         except Exception as error:
             return failure(self._split, unit, error)
+
+
+def worker_for(job: JobConfig, split: Path) -> Worker | Grower:
+    """Return this process's worker for a job, so that executors need not know the kind of job."""
+    return Grower(job, split) if isinstance(job, GrowConfig) else Worker(job, split)

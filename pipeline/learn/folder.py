@@ -21,7 +21,7 @@ from levelproof.levelgen.level import name_of
 from levelproof.physics.types import Size
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.learn.metrics import METRICS
-from levelproof.pipeline.store.disk import NotRegular, explaining_writes, read_regular
+from levelproof.pipeline.store.disk import explaining_writes, read_regular
 from levelproof.pipeline.store.files import write
 from levelproof.pipeline.store.locks import only_trainer
 from levelproof.pipeline.store.manifest import changes_text, differences
@@ -152,8 +152,6 @@ def continued(out: Path, fresh: T) -> T:
         if (out / CONFIG).exists():
             raise UserError(f"{out} has a policy, but no {CHECKPOINT}: put it back, or change -o.") from None
         return fresh
-    except NotRegular:
-        raise
     except OSError as error:
         raise Failure(f"Cannot read {out / CHECKPOINT} ({error.strerror or error}): make it readable.") from None
     except (LookupError, TypeError, ValueError, SafetensorError) as error:

@@ -28,7 +28,7 @@ from levelproof.pipeline.read.rows import read_row
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.files import replacing
-from levelproof.pipeline.store.manifest import Manifest, require_manifest
+from levelproof.pipeline.store.manifest import require_manifest
 
 STEPS_A_PICTURE = 2  # env steps between the pictures of a film: 15 pictures/s
 LAST_SECONDS = 1.5  # s that a film rests on its last picture
@@ -84,22 +84,12 @@ def film_of(source: Path, level_id: int | None, plays: bool = True) -> Film:
         raise UserError(f"Which level of {source}? Add its id, such as {require_manifest(source, []).level_ids[0]}.")
     manifest, row = find_level(source, level_id)
     if row["shard"]:
-        return witness_film(manifest, row)
+        return recorded_film(row, read_row(manifest.split, row), rules_of(manifest))
     caption = Caption(_title(row), outcome=row["label"], good=False)
     description = (
         f"level {level_id} of size {row['size']} is {row['label']} ({row['label_reason']}): there is no witness"
     )
     return _without_witness(levels_of(manifest, manifest.table), rules_of(manifest), caption, description, plays)
-
-
-def witness_film(manifest: Manifest, row: dict[str, Any]) -> Film:
-    """Film of the first episode of a solved level's record.
-
-    Raises:
-        Failure: the record does not reach the goal.
-    """
-    arrays = read_row(manifest.split, row)
-    return recorded_film(row, arrays, rules_of(manifest))
 
 
 def recorded_film(

@@ -256,10 +256,9 @@ def _column_of(leaf: pq.ColumnSchema) -> str:
     return leaf.path.partition(".")[0]
 
 
-def with_dictionaries(kind: FileKind = FRAGMENTS) -> list[str]:
-    """Return the paths of a file's leaves that are written with dictionaries."""
-    leaves = _expected(kind).leaves
-    return [leaf.path for leaf in leaves if _column_of(leaf) not in kind.own]
+def with_dictionaries() -> list[str]:
+    """Return the paths of a fragment's leaves that are written with dictionaries."""
+    return [leaf.path for leaf in _expected(FRAGMENTS).leaves if _column_of(leaf) not in FRAGMENTS.own]
 
 
 def _open(source: pa.NativeFile, texts: list[str]) -> pq.ParquetFile:

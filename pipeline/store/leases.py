@@ -225,18 +225,13 @@ def _taken(path: Path, text: bytes, say: Callable[[str], None]) -> Version:
 
 
 def is_written_by(split: Path, writer: str) -> bool:
-    """Whether this machine sees that a split's current or last writer has this token."""
-    return _writer(split) == writer
-
-
-def _writer(split: Path) -> str:
-    """Return the token of a split's current or last writer; empty: none."""
+    """Whether this machine sees that a split's current or last writer has this token; empty: that there was none."""
     path = split / WRITER_LOCK
     try:
         data = get(path).data if is_remote(path) else _lock_text(path)
     except (FileNotFoundError, NotRegular):
-        return ""
-    return str(_parsed(data).get("writer", "")) if data else ""
+        return not writer
+    return writer == (str(_parsed(data).get("writer", "")) if data else "")
 
 
 def _lock_text(path: Path) -> bytes:

@@ -18,7 +18,7 @@ import pyarrow as pa
 
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.runtime import cache_folder
-from levelproof.pipeline.store.disk import NotRegular, regular
+from levelproof.pipeline.store.disk import regular
 from levelproof.pipeline.store.pieces import CHECKSUM, TOUCH_INTERVAL, make_room
 
 VERSION = 1  # of these files
@@ -28,7 +28,7 @@ NAME_KEY = b"levelproof.table"
 MIN_BYTES = 2**22  # in memory; rereading smaller tables is as fast, and they take little memory
 MOST = 10 * 10**9  # bytes of all files; the least recently used ones are deleted first
 BLOCK = 2**20  # bytes that are summed at once
-DAMAGE = (OSError, ValueError, pa.ArrowException, NotRegular, UserError)  # what another file of this name can raise
+DAMAGE = (OSError, ValueError, pa.ArrowException, UserError)  # what another file of this name can raise
 
 
 def find_table(name: str) -> pa.Table | None:

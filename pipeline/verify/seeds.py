@@ -13,7 +13,7 @@ from levelproof.pipeline.store.manifest import read_manifest
 from levelproof.pipeline.store.named import open_shard
 from levelproof.pipeline.store.progress_bar import ProgressBar
 from levelproof.pipeline.store.seed.columns import ROW_GROUP
-from levelproof.pipeline.store.seed.file import STORED, missing_seed, read_seed, seed_files
+from levelproof.pipeline.store.seed.file import STORED, describe_seed, missing_seed, read_seed, seed_files
 from levelproof.pipeline.store.seed.source import LevelSource
 from levelproof.pipeline.store.seed.write import content_digest
 from levelproof.pipeline.verify.cores import Device, Map, on_cores
@@ -40,8 +40,8 @@ def examine_seeds(source: Path, console: Console | None, device: Device = None) 
     if len(whole) == len(files):
         findings.config = read_manifest(source, []).config  # raises if they mix several configurations
     elif whole:
-        findings.config = read_seed(whole[0], [])[0].fragment.config
-    count = sum(read_seed(path, [])[0].fragment.rows for path in whole)
+        findings.config = describe_seed(whole[0]).fragment.config
+    count = sum(describe_seed(path).fragment.rows for path in whole)
     with ProgressBar("levels", count, console) as progress, on_cores(count, device) as cores:
         for path in whole:
             _examine_file(path, findings, cores.map, progress)

@@ -42,7 +42,7 @@ READ_ROWS = 2 * BLOCK  # records in memory at a time
 UNRAVEL = f"numpy.stack(numpy.unravel_index(action, {CHOICES}), -1)"
 
 
-def export_minari(split: Path, where: str | None, out: Path, kind: ActionKind = ActionKind.MULTI_DISCRETE) -> None:
+def export_minari(split: Path, where: str | None, out: Path, kind: ActionKind) -> None:
     """Write witnesses that meet the condition (None: solved) to a new folder of Minari datasets; print a summary.
 
     Raises:

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from levelproof.experts.steps import EnvSteps
+from levelproof.experts.steps import EnvSteps, Totals
 from levelproof.pipeline.jobs import progress
 from levelproof.pipeline.jobs.progress import Board, Tally
 from levelproof.pipeline.jobs.schedule import Round, Summary, WorkUnit
@@ -23,10 +23,10 @@ def tally(done: int = 0) -> Tally:
 def test_tally_share_grows_with_decided_levels() -> None:
     now = tally()
     assert now.share == 0
-    now.running[UNIT] = (8_000, 7.5, 3)
+    now.running[UNIT] = Totals(8_000, 7.5, 3)
     assert now.share == pytest.approx(7.5 / 64)
     assert (now.decided, now.solved_so_far) == (7, 3)
-    now.running[UNIT] = (9_000, 16, 3)
+    now.running[UNIT] = Totals(9_000, 16, 3)
     assert now.share == pytest.approx(16 / 64)
     now.ended(UNIT, Summary(levels=16, solved=5, spent=EnvSteps(trained=16_000)))
     assert (now.share, now.done, now.solved_so_far) == (pytest.approx(16 / 64), 16, 5)
@@ -34,7 +34,7 @@ def test_tally_share_grows_with_decided_levels() -> None:
 
 def test_tally_discards_the_progress_of_a_failed_attempt() -> None:
     now = tally()
-    now.running[UNIT] = (8_000, 8.0, 3)
+    now.running[UNIT] = Totals(8_000, 8.0, 3)
     now.ended(UNIT, None)
     assert (now.share, now.solved_so_far) == (0, 0)
 
@@ -54,7 +54,7 @@ def test_board_estimates_exclude_compiling() -> None:
         assert text.getvalue().endswith("compiling\n")
     for second in range(100, 111):
         time[0] = float(second)
-        now.running[UNIT] = ((second - 99) * 800, (second - 99) * 0.8, 0)
+        now.running[UNIT] = Totals((second - 99) * 800, (second - 99) * 0.8, 0)
         board.refresh(0.0)
     assert text.getvalue().endswith("800 env steps/s · about 69 s left\n")  # (64 - 8.8) / 0.8
 
@@ -85,7 +85,7 @@ def test_board_keeps_its_pace_during_a_pause() -> None:
     board, text = board_at(now, time)
     for steps in (100, 200):
         time[0] += 1.0
-        now.running[UNIT] = (steps, steps / 100, 0)
+        now.running[UNIT] = Totals(steps, steps / 100, 0)
         board.refresh()
     time[0] += 1000.0
     board.refresh(0.0)
@@ -99,7 +99,7 @@ def test_board_has_no_pace_without_workers() -> None:
     board.watchers.append(lambda rate, left: seen.append((rate, left)))
     for steps in (100, 200):
         time[0] += 1.0
-        now.running[UNIT] = (steps, steps / 100, 0)
+        now.running[UNIT] = Totals(steps, steps / 100, 0)
         board.refresh(0.0)
     board.refresh(0.0, working=False)
     assert seen[1:] == [(100.0, 62.0), (0.0, None)]
@@ -111,7 +111,7 @@ def test_board_takes_no_pace_from_two_moments() -> None:
     board, text = board_at(now, time)
     for steps, at in (100, 0.0), (9_000, 0.001), (10_100, 2.0):
         time[0] = at
-        now.running[UNIT] = (steps, steps / 1000, 0)
+        now.running[UNIT] = Totals(steps, steps / 1000, 0)
         board.refresh(0.0)
     first, second, third = text.getvalue().splitlines()
     assert "· 0 env steps/s" in first
@@ -154,7 +154,7 @@ def test_board_says_once_that_experts_cannot_be_saved() -> None:
 
 def test_tally_text_says_writing_until_all_levels_are_committed() -> None:
     now = Tally(levels=16, done=0, solved=0)
-    now.running[UNIT] = (16_000, 16.0, 5)
+    now.running[UNIT] = Totals(16_000, 16.0, 5)
     assert now.text(0.0, None) == "16/16 levels · 5 solved · writing"
 
 

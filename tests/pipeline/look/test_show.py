@@ -21,7 +21,7 @@ from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.rules import TaskParams, advance, reset
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.look import show as show_module
-from levelproof.pipeline.look.show import do_nothing, film_of, show, witness_film
+from levelproof.pipeline.look.show import do_nothing, film_of, show
 from levelproof.pipeline.read.levels import find_level
 from levelproof.pipeline.store.manifest import require_manifest
 from tests.pipeline.made import PLAYED, made_job
@@ -116,8 +116,8 @@ def ends_late() -> int:
 
 def test_film_starts_with_the_resampled_level(split, tmp_path) -> None:
     """The first picture of a witness equals the level sampled from its id."""
-    manifest, row = find_level(split, level_with(split, "solved"))
-    film = witness_film(manifest, row)
+    _, row = find_level(split, level_with(split, "solved"))
+    film = film_of(split, row["level_id"])
     again = sample_levels(jnp.array([row["level_id"]], jnp.int32), SIZES["s"], made_job().distribution)
     world = (0, 40, 480, 480)
     bare = draw(again, again.state, action=np.zeros(6, np.int32)).crop(world)
@@ -170,7 +170,7 @@ def test_show_mp4_needs_ffmpeg(split, tmp_path, monkeypatch) -> None:
         show(split, level_with(split, "solved"), tmp_path / "other.mp4")
 
 
-def test_witness_film_refuses_a_record_without_success(split, monkeypatch) -> None:
+def test_film_of_a_witness_refuses_a_record_without_success(split, monkeypatch) -> None:
     monkeypatch.setattr(show_module, "succeeds", lambda done, goal: succeeds(done, ~goal))
     with pytest.raises(Failure, match="does not reach the goal"):
-        witness_film(*find_level(split, level_with(split, "solved")))
+        film_of(split, level_with(split, "solved"))
