@@ -20,7 +20,7 @@ from levelproof.levelgen.task.rules import TaskParams
 
 OWN = 0.5  # portability below which a witness of the search may replace an expert's own
 IN_CACHE = 256  # lanes: their physics fits the cache of a core
-Program = Callable[[Level, Int[np.ndarray, " level"], Success], Shortened]
+SearchAround = Callable[[Level, Int[np.ndarray, " level"], Success], Shortened]
 
 
 def rework(
@@ -44,13 +44,14 @@ def rework(
     search, replays = procedure.search, procedure.expert.replays
     witnesses, env_steps = list(chosen), np.zeros(len(chosen), np.int64)
 
-    def improve(some: Sequence[int], lanes: int, program: Program) -> None:
-        """Run a search program on a few levels at once, in `lanes` lanes each."""
+    def improve(some: Sequence[int], lanes: int, search_around: SearchAround) -> None:
+        """Search around the witnesses of a few levels at once, in `lanes` lanes each."""
         now = {i: witness for i in some if (witness := witnesses[i]) and witness.source != Source.NOTHING}
         candidates = {}
         for block in blocks(len(now), at_once(lanes, IN_CACHE)):
             at = np.array(list(now))[block]
-            result = jax.device_get(program(take(levels, at), level_ids[at], successes([now[i] for i in at.tolist()])))
+            given = take(levels, at), level_ids[at], successes([now[i] for i in at.tolist()])
+            result = jax.device_get(search_around(*given))
             env_steps[at] += result.env_steps  # a level that pads its block counts once
             for i, *success in zip(at.tolist(), *result.success, strict=True):
                 new = repeating(Success(*success), Source.SEARCH)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from levelproof.configs.schema import JobConfig
-from levelproof.pipeline.jobs.likeness import Program, mismatch, unseen
+from levelproof.pipeline.jobs.likeness import Versions, mismatch, unseen
 from levelproof.pipeline.jobs.schedule import Order, Round
 from levelproof.pipeline.runtime import own_core, prepare_jax, spare_imports
 from levelproof.pipeline.store.leases import serve
@@ -20,13 +20,13 @@ class WorkerActor:
         self._is_canceled = is_canceled
 
     def begin(
-        self, program: Program, job: JobConfig, split: Path, neighbours: int, writer: str
+        self, versions: Versions, job: JobConfig, split: Path, neighbours: int, writer: str
     ) -> str | tuple[int, int]:
         """Set the worker up (see `own_core`, `leases.serve`), or say why it cannot make the driver's levels.
 
         If the worker can share compiling with neighbours, it returns as `compile_next` does.
         """
-        if refusal := mismatch(program, job) or unseen(split, writer):
+        if refusal := mismatch(versions, job) or unseen(split, writer):
             return refusal
         prepare_jax(own_core(neighbours), job.device)
         # These modules read JAX's settings on import, so import them after JAX is set up

@@ -13,7 +13,7 @@ from levelproof.levelgen.programs import SOURCES, machine
 from levelproof.levelgen.sampling.sampler import CHUNK, sample_chunk
 from levelproof.physics.codegen.kept import key_by_sources
 from levelproof.pipeline.claims import try_claim
-from levelproof.pipeline.jobs.likeness import program_of
+from levelproof.pipeline.jobs.likeness import versions_of
 from levelproof.pipeline.runtime import cache_folder
 from levelproof.pipeline.store.provenance import device
 
@@ -30,7 +30,7 @@ class Ahead:
     def __init__(self, job: JobConfig, pool: Pool) -> None:
         folder, programs = cache_folder() / "jax", [*programs_of(pool, size_of(job.size)), *_sampling(job)]
         search = job.search.scaled(size_of(job.size).bodies)
-        of_code = [entry for entry in program_of(job).items() if entry[0] != "configuration"]
+        of_code = [entry for entry in versions_of(job).items() if entry[0] != "configuration"]
         settings = job.size, job.expert, search.endless, search.robustness, job.task, of_code, device()
         request = f"{settings} {machine()}"
         key = key_by_sources(request, SOURCES) or request

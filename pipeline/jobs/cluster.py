@@ -33,7 +33,7 @@ from levelproof.pipeline.errors import Failure, last_line
 from levelproof.pipeline.jobs.actor import WorkerActor
 from levelproof.pipeline.jobs.address import cannot_start, noticing_slow_starts, ray_address, require_reachable
 from levelproof.pipeline.jobs.choice import most_workers
-from levelproof.pipeline.jobs.likeness import program_of, with_absolute_paths
+from levelproof.pipeline.jobs.likeness import versions_of, with_absolute_paths
 from levelproof.pipeline.jobs.places import bytes_of_worker, memory_to_reserve, shortage, workers_by_machine
 from levelproof.pipeline.jobs.progress import STOPPING, Board, Meters
 from levelproof.pipeline.jobs.schedule import Round, Scheduler, Settle, UnitOutcome, levels_text, until_report
@@ -186,7 +186,7 @@ class Crew:
             self._started += 1
             name = f"levelproof {self._job.budget}/{self._job.size} worker {self._started}"
             neighbours = 0 if self._gpus else sum(other.node == handle.node for other in self._handles)
-            begin = program_of(self._job), self._job, self._split, neighbours, self._writer
+            begin = versions_of(self._job), self._job, self._split, neighbours, self._writer
             handle.start(name, int(self._gpus), *begin)
 
     def order(self) -> None:

@@ -14,23 +14,23 @@ from levelproof.pipeline.store.leases import is_written_by
 from levelproof.pipeline.store.provenance import learned_with, versions
 from levelproof.pipeline.store.remote import absolute, as_typed, is_remote
 
-Program = dict[str, str]  # versions by name
+Versions = dict[str, str]  # and hashes, by name
 COMPARED = ("levelproof", "jax", "jaxlib", "sampler")  # names in `provenance.versions`
 UNSEEN = 60  # s until a machine that does not see the split is left out
 FOLDERS = ("physics", "levelgen", "experts", "configs", "pipeline")
 ROOT = Path(__file__).parents[2]
 
 
-def program_of(job: JobConfig) -> Program:
+def versions_of(job: JobConfig) -> Versions:
     """Return the versions and hashes that must be equal in all processes that make a job's levels."""
     known = {name: str(versions()[name]) for name in COMPARED}
     return known | learned_with() | {"source": _source(), "configuration": job.hash}
 
 
-def mismatch(program: Program, job: JobConfig) -> str:
-    """Return a sentence on what differs between this worker's program and the driver's (`program`); empty: nothing."""
-    here = program_of(job)
-    for name, there in program.items():
+def mismatch(theirs: Versions, job: JobConfig) -> str:
+    """Return a sentence on what differs between this worker's versions and the driver's (`theirs`); empty: nothing."""
+    here = versions_of(job)
+    for name, there in theirs.items():
         if here.get(name) != there:
             return (
                 f"The worker on {socket.gethostname()} has {name} {here.get(name, 'unknown')}, and this command {name} "

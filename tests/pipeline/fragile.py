@@ -10,7 +10,7 @@ from pathlib import Path
 from levelproof.configs.schema import JobConfig
 from levelproof.pipeline.cli import main as cli
 from levelproof.pipeline.jobs import cluster
-from levelproof.pipeline.jobs.likeness import Program
+from levelproof.pipeline.jobs.likeness import Versions
 from levelproof.pipeline.jobs.schedule import Order, Round
 
 
@@ -19,10 +19,10 @@ class Fragile(cluster.WorkerActor):
 
     deadly = int(sys.argv[1])
 
-    def begin(self, program: Program, job: JobConfig, split: Path, neighbours: int, writer: str) -> str:
+    def begin(self, versions: Versions, job: JobConfig, split: Path, neighbours: int, writer: str) -> str:
         if self.deadly < 0:
             os._exit(1)
-        return super().begin(program, job, split, neighbours, writer)
+        return super().begin(versions, job, split, neighbours, writer)
 
     def work(self, order: Order, seconds: float) -> Round:
         if any(self.deadly in unit.level_ids for unit in order.units):

@@ -25,7 +25,7 @@ from rich.console import Console
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs import cluster, likeness
 from levelproof.pipeline.jobs.address import noticing_slow_starts, require_reachable
-from levelproof.pipeline.jobs.likeness import mismatch, program_of, unseen, with_absolute_paths
+from levelproof.pipeline.jobs.likeness import mismatch, unseen, versions_of, with_absolute_paths
 from levelproof.pipeline.jobs.progress import Board, Tally
 from levelproof.pipeline.jobs.schedule import MAX_UNITS, Round, Scheduler, UnitOutcome, WorkUnit
 from levelproof.pipeline.stopping import stoppable
@@ -456,12 +456,12 @@ def test_worker_that_does_not_see_the_split_is_refused(
 
 def test_mismatch_names_what_differs() -> None:
     job = made_job()
-    program = program_of(job)
-    assert mismatch(program, job) == ""
+    versions = versions_of(job)
+    assert mismatch(versions, job) == ""
     others = {"jax": "0.1", "optax": "0.1", "levelproof": "7", "configuration": "abc", "source": "def"}
     for name, other in others.items():
-        refusal = mismatch(program | {name: other}, job)
-        assert f" has {name} {program[name]}, and this command {name} {other}: install" in refusal
+        refusal = mismatch(versions | {name: other}, job)
+        assert f" has {name} {versions[name]}, and this command {name} {other}: install" in refusal
         assert socket.gethostname() in refusal
         assert f"(it imports {likeness.ROOT})" in refusal
 
