@@ -33,7 +33,7 @@ def main(folder: Path) -> None:
         known = sizes.get(size, {"labels": "", "successes": {}})
         for split in folder.glob(f"*/{size}"):
             table = require_manifest(split, COLUMNS).table.sort_by("level_id")
-            if not np.array_equal(table["level_id"].to_numpy(), np.array(sealed.SEALED)):
+            if not np.array_equal(table["level_id"].to_numpy(), np.array(sealed.SEALED_IDS)):
                 continue
             budget = table["budget"][0].as_py()
             known["successes"][budget] = "".join(sealed.SUCCESSES[each] for each in successes_of(table, ATTEMPTS))
@@ -48,7 +48,7 @@ def main(folder: Path) -> None:
 def digests_of(size: str) -> UInt8[np.ndarray, "level 16"]:
     """Return the content hashes of a size's sealed levels, without the version of their form."""
     with on_cpu():
-        hashes = content_hashes(jax.device_get(sample_levels(np.array(sealed.SEALED, np.int32), size)))
+        hashes = content_hashes(jax.device_get(sample_levels(np.array(sealed.SEALED_IDS, np.int32), size)))
     return np.array([[*bytes.fromhex(each.partition(":")[2])] for each in hashes], np.uint8)
 
 

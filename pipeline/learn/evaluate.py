@@ -27,7 +27,7 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.learn.looks import LOOKS, SEALED, log_look
 from levelproof.pipeline.learn.measured import MeasuredLevels, is_split, levels_in, midway_levels, sealed_levels
 from levelproof.pipeline.learn.published import AGENTS, PROTOCOLS, published_levels
-from levelproof.pipeline.learn.sealed import SEALED as SEALED_IDS
+from levelproof.pipeline.learn.sealed import SEALED_IDS
 from levelproof.pipeline.learn.solve_rates import Solved, difference, solve_rates
 from levelproof.pipeline.learn.specialists import Specialists, sealed_specialists, specialists_of
 from levelproof.pipeline.read.agents import SUFFIX as AGENT_SUFFIX

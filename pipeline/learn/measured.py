@@ -18,7 +18,7 @@ from levelproof.levelgen.sampling.sampler import check_size, on_cpu, sample_leve
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams
 from levelproof.pipeline.dataset.dataset import Dataset
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.learn.sealed import SEALED, known_sealed
+from levelproof.pipeline.learn.sealed import SEALED_IDS, known_sealed
 from levelproof.pipeline.read.level_files import levels_at, levels_below
 from levelproof.pipeline.read.levels import COLUMNS, levels_of, rules_of
 from levelproof.pipeline.read.select import labelled, require_selected
@@ -66,7 +66,7 @@ def sealed_levels(size: str, count: int | None) -> MeasuredLevels:
         check_size(size_of(size))
     except ValueError as error:
         raise UserError(f"Cannot sample sealed levels: {error}: set --size to s, m or l.") from None
-    ids = np.array(SEALED[:count], np.int32)
+    ids = np.array(SEALED_IDS[:count], np.int32)
     known = known_sealed(size)
     solved = known and known.solved[:count]
     with on_cpu():  # where they were labelled

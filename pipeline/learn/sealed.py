@@ -15,7 +15,7 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.read.select import both
 from levelproof.pipeline.words import many
 
-SEALED = range(2_000_000_000, 2_000_002_048)  # ids of the sealed levels
+SEALED_IDS = range(2_000_000_000, 2_000_002_048)  # ids of the sealed levels
 KNOWN, HASHES = "sealed.json", "sealed_hashes.npy"  # made by manifests/make_sealed.py; hashes: uint8 [level, 16]
 LETTERS = {Label.SOLVED: "s", Label.TRIVIAL: "t", Label.UNSOLVABLE: "x", Label.UNSOLVED: "u"}
 SUCCESSES = "0123456789abcdefg"  # one character per level: successes in 16 attempts
@@ -48,10 +48,10 @@ def sealed_hashes() -> frozenset[str]:
 
 def require_not_sealed(split: Path, ids: Int[np.ndarray, " level"], where: str) -> None:
     """Raise UserError if a split has sealed ids among these, which the condition `where` selects."""
-    if sealed := int(((ids >= SEALED.start) & (ids < SEALED.stop)).sum()):
+    if sealed := int(((ids >= SEALED_IDS.start) & (ids < SEALED_IDS.stop)).sum()):
         raise UserError(
-            f"{split} has {many(sealed, 'level')} with ids from {SEALED.start} to {SEALED.stop - 1}, which are sealed "
-            f'to measure policies: exclude them, as in where="{both(where, f"level_id < {SEALED.start}")}".'
+            f"{split} has {many(sealed, 'level')} with ids from {SEALED_IDS.start} to {SEALED_IDS.stop - 1}, which are "
+            f'sealed to measure policies: exclude them, as in where="{both(where, f"level_id < {SEALED_IDS.start}")}".'
         )
 
 

@@ -21,7 +21,7 @@ from levelproof.levelgen.sampling.sampler import sample_levels, sampler
 from levelproof.levelgen.task import rules as task
 from levelproof.levelgen.task.actions import CHOICES
 from levelproof.levelgen.task.rules import DEFAULT_RULES
-from levelproof.pipeline.learn.sealed import SEALED
+from levelproof.pipeline.learn.sealed import SEALED_IDS
 
 CONFIG = PPOConfig(repeat=1, discount=0.9, gae_lambda=0.8)
 
@@ -134,7 +134,7 @@ def test_average_of_equal_weights_is_exact() -> None:
 def test_random_levels_are_never_sealed_and_table_levels_are_all_drawn() -> None:
     ids = np.asarray(fresh(sampler("s"), jax.random.key(0), 100_000))
     assert ids.min() >= 0
-    assert ids.max() < SEALED.start
+    assert ids.max() < SEALED_IDS.start
     table = table_of(sample_levels(np.arange(5), "s"), DEFAULT_RULES)
     assert set(np.asarray(fresh(table, jax.random.key(0), 200)).tolist()) == set(range(5))
 

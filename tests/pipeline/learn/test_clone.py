@@ -32,7 +32,7 @@ from levelproof.pipeline.learn import pool as pool_module
 from levelproof.pipeline.learn.clone import COURSE
 from levelproof.pipeline.learn.curves import draw_curves
 from levelproof.pipeline.learn.pool import Feed, read_pool, validation_batches
-from levelproof.pipeline.learn.sealed import SEALED
+from levelproof.pipeline.learn.sealed import SEALED_IDS
 from levelproof.pipeline.learn.trained_on import levels_for
 from levelproof.pipeline.store.locks import only_trainer
 from tests.pace import patience
@@ -250,7 +250,7 @@ def test_bad_input_is_refused(split: Path, policy: Path, tmp_path: Path, monkeyp
     (tmp_path / "file").touch()
     assert_refused(here(["clone", str(split), "-o", "file"], tmp_path), 2, "Cannot write a policy to file")
     first = int(levelproof.open(split).manifest["level_id"][0].as_py())
-    monkeypatch.setattr(sealed, "SEALED", range(first, first + 2))
+    monkeypatch.setattr(sealed, "SEALED_IDS", range(first, first + 2))
     with pytest.raises(levelproof.UserError, match="sealed"):
         module.source_of(split, CloneConfig(where=""), print)
 
@@ -336,7 +336,7 @@ def test_clone_writes_nothing_to_a_recreated_folder(
 
 
 def test_copies_of_sealed_levels_are_left_out(tmp_path: Path) -> None:
-    copies, messages = played_split(tmp_path / "copies", copies=SEALED[-16:]), []
+    copies, messages = played_split(tmp_path / "copies", copies=SEALED_IDS[-16:]), []
     source = module.source_of(copies, CloneConfig(where="", validation=0.5), messages.append)
     others = np.flatnonzero(source.data.manifest["level_id"].to_numpy() >= 16)
     assert 1 < source.copies == len(source.data) - len(others)

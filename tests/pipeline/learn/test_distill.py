@@ -246,7 +246,7 @@ def test_levels_are_witnessed_and_neither_trivial_nor_sealed(split: Path, monkey
     assert told == [f"Only 3 of {len(ids):,} levels of {split} are used, drawn once: raise pool for more."]
     few = module.witnessed(some, NetworkConfig(), quiet)
     assert len(few.level_ids) == len(few.levels) == len(few.witnesses.steps) == 3
-    monkeypatch.setattr(sealed, "SEALED", range(int(ids[0]), int(ids[0]) + 1))
+    monkeypatch.setattr(sealed, "SEALED_IDS", range(int(ids[0]), int(ids[0]) + 1))
     with pytest.raises(levelproof.UserError, match="sealed to measure policies"):
         module.levels_for(split, config, print)
 

@@ -32,7 +32,7 @@ from levelproof.pipeline.exchange.level_json import export
 from levelproof.pipeline.learn import evaluate, published
 from levelproof.pipeline.learn.looks import LOOKS, log_look
 from levelproof.pipeline.learn.measured import levels_in, midway_levels
-from levelproof.pipeline.learn.sealed import SEALED
+from levelproof.pipeline.learn.sealed import SEALED_IDS
 from levelproof.pipeline.learn.specialists import specialists_of
 from levelproof.pipeline.read.agents import agent_in
 from levelproof.pipeline.store.job_note import note_job
@@ -204,8 +204,8 @@ def test_policies_are_compared_on_the_same_levels_and_both_looks_are_logged(tmp_
         (tmp_path / name).write_text(act)
     (tmp_path / "three.py").write_text(act.replace("uniform *", "0 * uniform *"))
     split = tmp_path / "seeds.parquet"
-    done = here(["generate", "procedure=label", "budget=16k", "levels=32", f"first_level={SEALED.start - 16}", "out=d",
-                 "executor=inline", "search.env_steps=4096", "search.variations=0"], tmp_path)  # fmt: skip
+    done = here(["generate", "procedure=label", "budget=16k", "levels=32", f"first_level={SEALED_IDS.start - 16}",
+                 "out=d", "executor=inline", "search.env_steps=4096", "search.variations=0"], tmp_path)  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert here(["export", "d/16k/s", "--format", "seed", "-o", str(split)], tmp_path).returncode == 0
     (same,) = facts(tmp_path, "one.py", "--against", "two.py", "--on", str(split), "--attempts", "2")["levels"]

@@ -9,7 +9,7 @@ import pytest
 import levelproof
 from levelproof.levelgen.identity.content import content_hashes
 from levelproof.levelgen.level import SIZES
-from levelproof.pipeline.learn.sealed import SEALED, known_sealed, sealed_hashes
+from levelproof.pipeline.learn.sealed import SEALED_IDS, known_sealed, sealed_hashes
 from levelproof.pipeline.learn.specialists import sealed_specialists, successes_of
 from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.command import here
@@ -25,7 +25,7 @@ def test_known_sealed_levels_are_what_a_job_makes_of_them(size: str, tmp_path: P
     How many levels of l differ says less: most of its experts hardly ever succeed, and have 0 or 1 by chance.
     """
     then = "search.bodies=7 search.patience=393216 search.patience_gap=0"  # the defaults when they were labelled
-    job = f"generate size={size} first_level={SEALED.start} levels=32 budget=256k executor=inline {then}"
+    job = f"generate size={size} first_level={SEALED_IDS.start} levels=32 budget=256k executor=inline {then}"
     assert here(job.split(), tmp_path).returncode == 0
     table = read_manifest(tmp_path / "data" / "256k" / size).table.sort_by("level_id")
     known = known_sealed(size)
@@ -41,11 +41,11 @@ def test_known_sealed_levels_are_what_a_job_makes_of_them(size: str, tmp_path: P
 @pytest.mark.parametrize("size", ["s", *(pytest.param(size, marks=pytest.mark.slow) for size in ("m", "l"))])
 def test_known_hashes_are_those_of_the_sealed_levels(size: str) -> None:
     """If this fails after a change of the sampler or of hashes, run manifests/make_sealed.py."""
-    levels = jax.device_get(levelproof.sample_levels(np.array(SEALED, np.int32), size))
+    levels = jax.device_get(levelproof.sample_levels(np.array(SEALED_IDS, np.int32), size))
     hashes = {*content_hashes(levels)}
-    assert len(hashes) == len(SEALED)
+    assert len(hashes) == len(SEALED_IDS)
     assert hashes < sealed_hashes()
-    assert len(sealed_hashes()) == len(SIZES) * len(SEALED)
+    assert len(sealed_hashes()) == len(SIZES) * len(SEALED_IDS)
 
 
 def test_known_sealed_levels_fit_the_sealed_ids() -> None:
@@ -53,10 +53,10 @@ def test_known_sealed_levels_fit_the_sealed_ids() -> None:
     for size in SIZES:
         known = known_sealed(size)
         assert known is not None
-        assert known.solved.shape == (len(SEALED),)
+        assert known.solved.shape == (len(SEALED_IDS),)
         names = [each.name for each in sealed_specialists(size, 64, 8)]
         assert names == [f"its own expert, {budget}" for budget in known.successes]
         best = [*known.successes.values()][-1]
-        assert best.shape == (len(SEALED),)
+        assert best.shape == (len(SEALED_IDS),)
         assert 0 <= best.min() <= best.max() == 16
         assert np.mean(best[known.solved] > 0) > 0.7

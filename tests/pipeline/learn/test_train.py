@@ -285,7 +285,7 @@ def test_level_sources(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         levels_for(TrainConfig(levels=str(tmp_path / "two")), print)
     shutil.rmtree(tmp_path / "two")
     first = ids[0]
-    monkeypatch.setattr(sealed, "SEALED", range(first, first + 2))
+    monkeypatch.setattr(sealed, "SEALED_IDS", range(first, first + 2))
     with pytest.raises(levelproof.UserError, match=f'sealed to measure policies.*where="level_id < {first}"'):
         levels_for(TrainConfig(levels=str(split), where=""), print)
     with pytest.raises(levelproof.UserError, match=rf"where=\"\(label = 'solved'\) AND level_id < {first}\""):
