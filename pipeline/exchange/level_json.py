@@ -4,8 +4,9 @@ from pathlib import Path
 
 from levelproof.levelgen.files.level_file import LevelFile, LevelFileError, write_level_file
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.read.levels import find_level, levels_of, rules_of, writing_to
+from levelproof.pipeline.read.levels import find_level, levels_of, rules_of
 from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store.created import writing_to
 from levelproof.pipeline.store.files import replacing
 
 

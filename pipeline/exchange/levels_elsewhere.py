@@ -18,9 +18,9 @@ from levelproof.physics.step import ENGINE_VERSION
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.exchange.seed import check_new_seed
 from levelproof.pipeline.read.level_files import level_file_paths
-from levelproof.pipeline.read.levels import writing_to
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store import files
+from levelproof.pipeline.store.created import writing_to
 from levelproof.pipeline.store.origins import can_be_noted
 from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.seed.columns import ROW_GROUP, SCHEMA

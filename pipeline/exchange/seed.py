@@ -19,12 +19,13 @@ from levelproof.levelgen.level import Level, size_of
 from levelproof.levelgen.sampling.sampler import CHUNK
 from levelproof.levelgen.task.actions import action_mask
 from levelproof.pipeline.errors import Failure, UserError
-from levelproof.pipeline.read.levels import levels_of, writing_to
+from levelproof.pipeline.read.levels import levels_of
 from levelproof.pipeline.read.rows import read_rows
 from levelproof.pipeline.read.select import both, columns_in, select_some
 from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store import files
 from levelproof.pipeline.store.contents import table_for
+from levelproof.pipeline.store.created import writing_to
 from levelproof.pipeline.store.density import LAST_DISTANCE, MOVES, STATE, task_states
 from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.manifest import Manifest, require_manifest

@@ -36,8 +36,9 @@ from levelproof.pipeline.look.readme import (
     SplitFacts,
     readme,
 )
-from levelproof.pipeline.read.levels import distribution_of, writing_to
+from levelproof.pipeline.read.levels import distribution_of
 from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store.created import writing_to
 from levelproof.pipeline.store.disk import NotRegular
 from levelproof.pipeline.store.files import replacing, write
 from levelproof.pipeline.store.layout import SHARDS

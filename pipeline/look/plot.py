@@ -10,8 +10,8 @@ from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.look.figures import draw_panels
 from levelproof.pipeline.look.query import RowQuery, prepare_for_seeds
 from levelproof.pipeline.look.spread import spread
-from levelproof.pipeline.read.levels import writing_to
 from levelproof.pipeline.read.select import columns_in, labelled, select
+from levelproof.pipeline.store.created import writing_to
 from levelproof.pipeline.store.files import replacing
 from levelproof.pipeline.store.manifest import require_manifest
 from levelproof.pipeline.store.remote import as_typed

@@ -12,8 +12,8 @@ from levelproof.levelgen.level import size_of
 from levelproof.levelgen.pictures.raster import Caption, draw, sheet, write_png
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.read.levels import writing_to
 from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store.created import writing_to
 from levelproof.pipeline.store.files import replacing
 
 LEVELS = 15  # default number of levels

@@ -23,9 +23,10 @@ from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.types import State
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.look.spread import spread
-from levelproof.pipeline.read.levels import find_level, is_level_file, level_file, levels_of, rules_of, writing_to
+from levelproof.pipeline.read.levels import find_level, is_level_file, level_file, levels_of, rules_of
 from levelproof.pipeline.read.rows import read_row
 from levelproof.pipeline.runtime import prepare_jax
+from levelproof.pipeline.store.created import writing_to
 from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.files import replacing
 from levelproof.pipeline.store.manifest import require_manifest

@@ -1,4 +1,4 @@
-"""Levels of a split by id, level files that users name, and the output files of single levels."""
+"""Levels of a split by id, and level files that users name."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -117,20 +117,6 @@ def recorded_settings(split: Path) -> Iterator[None]:
         raise Failure(
             f"This levelproof does not accept the settings of {split} ({error}): use the version that made it."
         ) from None
-
-
-@contextmanager
-def writing_to(out: Path) -> Iterator[None]:
-    """Create the parent folder of `out`, and report I/O errors of the `with` block, which writes `out`.
-
-    Raises:
-        UserError: `out` cannot be written.
-    """
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        yield
-    except OSError as error:
-        raise UserError(f"Cannot write {out} ({error.strerror or error}): choose another file with -o.") from None
 
 
 def is_level_file(source: Path) -> bool:

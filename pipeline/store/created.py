@@ -1,4 +1,4 @@
-"""Output folders that users name, which appear whole or not at all."""
+"""Outputs that users name: folders, which appear whole or not at all, and single files."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -38,3 +38,17 @@ def new_folder(out: Path, replaces: Callable[[Path], bool] = lambda _: False) ->
                 raise
     except OSError as error:
         raise UserError(f"Cannot write {out} ({error.strerror or error}): choose another folder with -o.") from None
+
+
+@contextmanager
+def writing_to(out: Path) -> Iterator[None]:
+    """Create the parent folder of `out`, and report I/O errors of the `with` block, which writes `out`.
+
+    Raises:
+        UserError: `out` cannot be written.
+    """
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    except OSError as error:
+        raise UserError(f"Cannot write {out} ({error.strerror or error}): choose another file with -o.") from None
