@@ -21,7 +21,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from levelproof.pipeline.look.card import CardOptions, card
+    from levelproof.pipeline.look.card import card
+    from levelproof.pipeline.look.readme import CardOptions
 
     options = CardOptions(arguments.license, arguments.name, arguments.repo, arguments.code)
     card(arguments.splits, arguments.out, options)

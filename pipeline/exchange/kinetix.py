@@ -16,8 +16,8 @@ from levelproof.pipeline.store.created import new_folder
 from levelproof.pipeline.store.fields import tree_of
 from levelproof.pipeline.store.manifest import require_manifest
 from levelproof.pipeline.store.progress_bar import shown_blocks
-from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.shard import stored_bytes
+from levelproof.pipeline.urls import as_typed
 from levelproof.pipeline.words import many
 
 BLOCK = 4 * ROWS  # trajectories in memory at a time

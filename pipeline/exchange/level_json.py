@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from levelproof.levelgen.files.level_file import LevelFile, LevelFileError, write_level_file
+from levelproof.levelgen.files.entries import LevelFileError
+from levelproof.levelgen.files.level_file import LevelFile, write_level_file
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.read.levels import find_level, levels_of, rules_of
 from levelproof.pipeline.runtime import prepare_jax

@@ -10,7 +10,8 @@ import pyarrow as pa
 
 from levelproof.configs.schema import from_files
 from levelproof.experts.witness.episode import play_episodes
-from levelproof.levelgen.files.level_file import LevelFileError, read_level_file
+from levelproof.levelgen.files.entries import LevelFileError
+from levelproof.levelgen.files.level_file import read_level_file
 from levelproof.levelgen.identity.content import content_hashes, level_id_for
 from levelproof.levelgen.level import Level, concatenate_levels, name_of
 from levelproof.levelgen.sampling.sampler import CHUNK
@@ -22,13 +23,13 @@ from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.store import files
 from levelproof.pipeline.store.created import writing_to
 from levelproof.pipeline.store.origins import can_be_noted
-from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.seed.columns import ROW_GROUP, SCHEMA
 from levelproof.pipeline.store.seed.file import SeedFile, damaged_seed, read_seed, seed_files
 from levelproof.pipeline.store.seed.packed import unpack_witnesses
 from levelproof.pipeline.store.seed.source import LevelSource
 from levelproof.pipeline.store.seed.worlds import pack_worlds
 from levelproof.pipeline.store.seed.write import content_digest, seed_bytes
+from levelproof.pipeline.urls import as_typed
 from levelproof.pipeline.words import many
 
 

@@ -10,9 +10,9 @@ import pyarrow as pa
 from levelproof.levelgen.level import Level, size_of
 from levelproof.physics.types import Size
 from levelproof.pipeline.errors import UserError
-from levelproof.pipeline.store.contents import ContentsError, check_numbers, level_fields
+from levelproof.pipeline.store.contents import check_numbers, level_fields
 from levelproof.pipeline.store.fields import arrays_of, tree_of
-from levelproof.pipeline.store.formats import FieldSpec
+from levelproof.pipeline.store.formats import ContentsError, FieldSpec
 
 
 def column_fields(size: Size) -> dict[str, FieldSpec]:

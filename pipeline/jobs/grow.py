@@ -15,11 +15,12 @@ from levelproof.pipeline.jobs.schedule import WorkUnit, levels_text
 from levelproof.pipeline.store import quarantine
 from levelproof.pipeline.store.manifest import read_manifest, require_manifest
 from levelproof.pipeline.store.progress_bar import say
-from levelproof.pipeline.store.remote import absolute, as_typed
+from levelproof.pipeline.store.remote import absolute
 from levelproof.pipeline.store.seed.columns import ROW_GROUP
 from levelproof.pipeline.store.seed.file import describe_seed, is_seed, read_seed, seed_files
 from levelproof.pipeline.store.seed.source import LevelSource, without_levels
 from levelproof.pipeline.store.seed.write import content_digest
+from levelproof.pipeline.urls import as_typed
 from levelproof.pipeline.words import many
 
 SETTINGS = ("density", "key_every", "executor", "workers")

@@ -24,8 +24,8 @@ from levelproof.pipeline.store.layout import SHARDS, new_attempt, unit_name
 from levelproof.pipeline.store.locks import committing
 from levelproof.pipeline.store.manifest import begin_fragment, read_manifest, with_places, write_fragment
 from levelproof.pipeline.store.publish import committed_levels
-from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.store.shard import write_shard
+from levelproof.pipeline.urls import as_typed
 
 
 class Grower:

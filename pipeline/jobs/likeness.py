@@ -12,7 +12,8 @@ from pathlib import Path
 from levelproof.configs.schema import JobConfig
 from levelproof.pipeline.store.leases import is_written_by
 from levelproof.pipeline.store.provenance import learned_with, versions
-from levelproof.pipeline.store.remote import absolute, as_typed, is_remote
+from levelproof.pipeline.store.remote import absolute
+from levelproof.pipeline.urls import as_typed, is_remote
 
 Versions = dict[str, str]  # and hashes, by name
 COMPARED = ("levelproof", "jax", "jaxlib", "sampler")  # names in `provenance.versions`

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 from levelproof.configs.schema import JobConfig
 from levelproof.pipeline.errors import UserError, last_line
 from levelproof.pipeline.store.event_files import Event
-from levelproof.pipeline.store.remote import is_remote
+from levelproof.pipeline.urls import is_remote
 
 LIBRARIES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
 FOLDER, PROJECT = "log", "levelproof"

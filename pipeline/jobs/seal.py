@@ -16,9 +16,10 @@ from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store import seal as store
 from levelproof.pipeline.store.bounds import MAX_ROWS
 from levelproof.pipeline.store.disk import explaining_writes
+from levelproof.pipeline.store.fragment import Fragment
 from levelproof.pipeline.store.job_note import note_density
 from levelproof.pipeline.store.layout import fragment_path, unit_name
-from levelproof.pipeline.store.manifest import Fragment, require_manifest
+from levelproof.pipeline.store.manifest import require_manifest
 from levelproof.pipeline.store.progress_bar import ProgressBar, say
 from levelproof.pipeline.store.scratch import written_disk
 from levelproof.pipeline.store.seal import Piece, seal

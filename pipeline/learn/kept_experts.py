@@ -16,8 +16,8 @@ from levelproof.pipeline.read.levels import recorded_settings
 from levelproof.pipeline.store.checkpoints import load_experts
 from levelproof.pipeline.store.layout import data_path
 from levelproof.pipeline.store.manifest import require_manifest
-from levelproof.pipeline.store.remote import as_typed, is_remote
 from levelproof.pipeline.store.seed.file import is_seed
+from levelproof.pipeline.urls import as_typed, is_remote
 
 WITHOUT = "set teachers.expert=0 and demonstrations=0 to do without them"
 

@@ -25,9 +25,8 @@ from levelproof.pipeline.read.select import labelled, require_selected
 from levelproof.pipeline.store.job_note import sound_note
 from levelproof.pipeline.store.manifest import fragment_paths, refuse_folder_of_splits, require_manifest
 from levelproof.pipeline.store.progress_bar import shown_blocks
-from levelproof.pipeline.store.remote import as_typed, is_remote
 from levelproof.pipeline.store.seed.file import is_seed
-from levelproof.pipeline.urls import quoted
+from levelproof.pipeline.urls import as_typed, is_remote, quoted
 
 AT_ONCE = 256  # witnesses per read
 LEVELS_AT_ONCE = 2**14  # levels per read, with their records up to 100 MB; each read opens its shards

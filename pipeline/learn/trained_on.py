@@ -23,8 +23,8 @@ from levelproof.pipeline.learn.measured import MeasuredLevels, is_split, levels_
 from levelproof.pipeline.learn.sealed import require_not_sealed, require_some_usable, without_sealed
 from levelproof.pipeline.read.level_files import rule_settings
 from levelproof.pipeline.store.progress_bar import shown_blocks
-from levelproof.pipeline.store.remote import is_remote
 from levelproof.pipeline.store.seed.rows import MANY
+from levelproof.pipeline.urls import is_remote
 
 
 class TrainingLevels(NamedTuple):

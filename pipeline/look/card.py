@@ -44,10 +44,10 @@ from levelproof.pipeline.store.files import replacing, write
 from levelproof.pipeline.store.layout import SHARDS
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 from levelproof.pipeline.store.named import bytes_named
-from levelproof.pipeline.store.remote import as_typed, is_listed, is_remote, require_folder
+from levelproof.pipeline.store.remote import is_listed, require_folder
 from levelproof.pipeline.store.seed.file import SUFFIX, is_seed
 from levelproof.pipeline.store.shard import stored_bytes
-from levelproof.pipeline.urls import HUB, quoted
+from levelproof.pipeline.urls import HUB, as_typed, is_remote, quoted
 from levelproof.pipeline.version import __version__
 
 README = "README.md"

@@ -25,8 +25,8 @@ from levelproof.pipeline.look.inspect import QUANTILES, SPENT
 from levelproof.pipeline.look.query import prepare_for_seeds
 from levelproof.pipeline.read.select import columns_in, labelled, select
 from levelproof.pipeline.store.manifest import Manifest, changes_text, differences, require_manifest
-from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.tables import console_for_tables, folded
+from levelproof.pipeline.urls import as_typed
 from levelproof.pipeline.words import number
 
 READ = (*cost.READ, "steps_to_goal", *SPENT)

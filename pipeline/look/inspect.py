@@ -24,8 +24,9 @@ from levelproof.pipeline.read.levels import distribution_of
 from levelproof.pipeline.read.select import columns_in, select
 from levelproof.pipeline.store.manifest import Manifest, require_manifest
 from levelproof.pipeline.store.named import bytes_named
-from levelproof.pipeline.store.remote import as_typed, is_listed
+from levelproof.pipeline.store.remote import is_listed
 from levelproof.pipeline.tables import console_for_tables
+from levelproof.pipeline.urls import as_typed
 
 QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
 SPENT = tuple(STEPS)

@@ -14,7 +14,7 @@ from levelproof.pipeline.read.select import columns_in, labelled, select
 from levelproof.pipeline.store.created import writing_to
 from levelproof.pipeline.store.files import replacing
 from levelproof.pipeline.store.manifest import require_manifest
-from levelproof.pipeline.store.remote import as_typed
+from levelproof.pipeline.urls import as_typed
 from levelproof.pipeline.words import many
 
 KINDS = (".svg", ".png")

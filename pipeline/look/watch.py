@@ -21,8 +21,8 @@ from levelproof.pipeline.store.event_files import events_of, runs_in
 from levelproof.pipeline.store.layout import EVENTS
 from levelproof.pipeline.store.locks import is_written
 from levelproof.pipeline.store.progress_bar import LINE_EVERY
-from levelproof.pipeline.store.remote import as_typed
 from levelproof.pipeline.tables import folded
+from levelproof.pipeline.urls import as_typed
 from levelproof.pipeline.words import duration, many
 
 INTERVAL = 2.0  # s between refreshes

@@ -11,7 +11,8 @@ import numpy as np
 from levelproof.configs.convert import flat, plain
 from levelproof.configs.schema import JobConfig
 from levelproof.experts.networks.saved import CONFIG, WEIGHTS
-from levelproof.levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
+from levelproof.levelgen.files.entries import LevelFileError
+from levelproof.levelgen.files.level_file import LevelFile, read_level_file
 from levelproof.levelgen.identity.content import content_hashes, level_id_for
 from levelproof.levelgen.level import Level, concatenate_levels, name_of, size_of
 from levelproof.levelgen.task.rules import DEFAULT_RULES, TaskParams

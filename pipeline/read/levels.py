@@ -9,7 +9,8 @@ import numpy as np
 import pyarrow as pa
 
 from levelproof.configs.schema import distribution_in, other_sampler, rules_in
-from levelproof.levelgen.files.level_file import LevelFile, LevelFileError, read_level_file
+from levelproof.levelgen.files.entries import LevelFileError
+from levelproof.levelgen.files.level_file import LevelFile, read_level_file
 from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
 from levelproof.levelgen.level import Level, concatenate_levels, size_of
 from levelproof.levelgen.sampling.sampler import Distribution, on_cpu, sample_levels

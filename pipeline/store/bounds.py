@@ -22,8 +22,9 @@ import pyarrow.parquet as pq
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.checksums import TAIL
 from levelproof.pipeline.store.columns import COLUMNS, OWN, REPETITIVE, schema_of
-from levelproof.pipeline.store.remote import bytes_of, is_remote
+from levelproof.pipeline.store.remote import bytes_of
 from levelproof.pipeline.store.thrift import PLAIN, Column, footer_in, pages_in
+from levelproof.pipeline.urls import is_remote
 
 MAX_FOOTER = 2**24  # bytes; most of them are digests
 MAX_ROWS, MAX_GROUPS = 2**20, 2**9  # of a fragment; a sealed one has 100,000 rows, in groups of 16,384

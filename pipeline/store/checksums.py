@@ -11,7 +11,8 @@ from collections.abc import Iterable, Mapping
 from io import BytesIO
 from pathlib import Path
 
-from levelproof.pipeline.store.remote import at_once, bytes_of, is_listed, is_remote, stored_at, stored_in
+from levelproof.pipeline.store.remote import at_once, bytes_of, is_listed, stored_at, stored_in
+from levelproof.pipeline.urls import is_remote
 
 MARK = b"levelproof.sha256:"  # before a fragment's own digest
 OWN = len(MARK) + hashlib.sha256().digest_size

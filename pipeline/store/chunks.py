@@ -18,8 +18,9 @@ import google_crc32c
 import numpy as np
 from numcodecs import blosc  # pyright: ignore[reportAttributeAccessIssue]
 
-from levelproof.pipeline.store.contents import ContentsError
-from levelproof.pipeline.store.remote import RemoteFile, bytes_of, is_remote
+from levelproof.pipeline.store.formats import ContentsError
+from levelproof.pipeline.store.remote import RemoteFile, bytes_of
+from levelproof.pipeline.urls import is_remote
 
 MAX_METADATA = 2**24  # bytes of a zarr.json; a level takes up to 12
 CHECKSUM = 4  # bytes of a CRC-32C

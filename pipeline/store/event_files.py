@@ -17,7 +17,7 @@ from levelproof.pipeline.errors import LevelproofError
 from levelproof.pipeline.store.files import remove, write
 from levelproof.pipeline.store.layout import EVENTS, entries
 from levelproof.pipeline.store.objects import get
-from levelproof.pipeline.store.remote import is_remote
+from levelproof.pipeline.urls import is_remote
 
 RUN = re.compile(rf"{EVENTS}/[0-9]{{8}}T[0-9]{{12}}-[0-9a-f]{{8}}\.jsonl")
 HALF = re.compile(rf"{EVENTS}/\.[0-9]{{8}}T[0-9]{{12}}-[0-9a-f]{{8}}\.jsonl\.[0-9]+")  # from a dead run

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from levelproof.pipeline.store import objects
 from levelproof.pipeline.store.disk import flush_entry, write_new
-from levelproof.pipeline.store.remote import at_once, is_remote, stored_in
+from levelproof.pipeline.store.remote import at_once, stored_in
+from levelproof.pipeline.urls import is_remote
 
 
 def write(path: Path, data: bytes, mode: int = 0o666, durable: bool = False) -> None:

@@ -16,7 +16,7 @@ from levelproof.pipeline.store.bounds import unread
 from levelproof.pipeline.store.files import write
 from levelproof.pipeline.store.layout import JOB
 from levelproof.pipeline.store.objects import get
-from levelproof.pipeline.store.remote import is_remote
+from levelproof.pipeline.urls import is_remote
 
 MAX_BYTES = 2**26  # of a file; a run of level ids takes about 25, and each level of a level file is a run
 DIGEST = "sha256"  # JSON key

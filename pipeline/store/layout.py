@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from levelproof.pipeline.errors import Failure
-from levelproof.pipeline.store.remote import INDEX, fragments_in, is_remote, names_in
-from levelproof.pipeline.urls import BUCKETS
+from levelproof.pipeline.store.remote import INDEX, fragments_in, names_in
+from levelproof.pipeline.urls import BUCKETS, is_remote
 
 MANIFEST, SHARDS, EXPERTS, QUARANTINE, CHECKPOINTS = "manifest", "shards", "experts", "quarantine", "checkpoints"
 FOLDERS = MANIFEST, SHARDS, EXPERTS, QUARANTINE, CHECKPOINTS

@@ -25,7 +25,7 @@ from levelproof.pipeline.store.disk import NotRegular, regular, to_drive
 from levelproof.pipeline.store.layout import WRITER_LOCK
 from levelproof.pipeline.store.machine import boot_id
 from levelproof.pipeline.store.objects import Version, get, put_if
-from levelproof.pipeline.store.remote import as_typed, is_remote
+from levelproof.pipeline.urls import as_typed, is_remote
 
 SILENCE = 60.0  # s without a renewal after which a writer counts as dead
 RENEWAL = 5.0  # s between renewals

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from levelproof.pipeline.store.disk import flush_entry, regular
 from levelproof.pipeline.store.files import remove, remove_data
+from levelproof.pipeline.store.fragment import read_fragment
 from levelproof.pipeline.store.layout import (
     BEGUN,
     INDEX_BEGUN,
@@ -21,10 +22,11 @@ from levelproof.pipeline.store.layout import (
     entries,
 )
 from levelproof.pipeline.store.locks import without_commits
-from levelproof.pipeline.store.manifest import DATA_COLUMNS, Manifest, data_named_by, read_fragment, read_manifest
+from levelproof.pipeline.store.manifest import DATA_COLUMNS, Manifest, data_named_by, read_manifest
 from levelproof.pipeline.store.objects import put
 from levelproof.pipeline.store.publish import OVER, ended
-from levelproof.pipeline.store.remote import as_typed, at_once, is_remote
+from levelproof.pipeline.store.remote import at_once
+from levelproof.pipeline.urls import as_typed, is_remote
 
 
 def clean(split: Path, say: Callable[[str], None]) -> Manifest:

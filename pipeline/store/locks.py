@@ -19,8 +19,7 @@ from levelproof.pipeline.store.disk import NotRegular, regular
 from levelproof.pipeline.store.layout import COMMIT_LOCK, WRITER_LOCK
 from levelproof.pipeline.store.leases import is_leased, leased, named, require_served
 from levelproof.pipeline.store.publish import publishing
-from levelproof.pipeline.store.remote import is_remote
-from levelproof.pipeline.urls import BUCKETS
+from levelproof.pipeline.urls import BUCKETS, is_remote
 
 PATIENCE = 1.0  # s to wait for the writer's lock, because `is_written` holds it for a moment
 NOTICE = 2.0  # s of waiting before the user is told the reason

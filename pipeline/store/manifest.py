@@ -31,11 +31,11 @@ from levelproof.pipeline.store.formats import CONFIG_KEY, DENSITIES_KEY, DIGESTS
 from levelproof.pipeline.store.fragment import FULL, Fragment, read_fragment
 from levelproof.pipeline.store.layout import FRAGMENT, JOB, MANIFEST, Attempt, entries, ids_of
 from levelproof.pipeline.store.progress_bar import ProgressBar
-from levelproof.pipeline.store.remote import INDEX, is_listed, is_remote, stale_index
+from levelproof.pipeline.store.remote import INDEX, is_listed, stale_index
 from levelproof.pipeline.store.runs import ascending, within
 from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.store.seed.rows import seed_parts
-from levelproof.pipeline.urls import quoted, require_known
+from levelproof.pipeline.urls import is_remote, quoted, require_known
 
 MAX_SHOWN = 6  # differing settings that an error lists
 # Fragments read at once: more than cores, because shared folders have latency; not many more, because threads wait for

@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from levelproof.pipeline.errors import Failure
+from levelproof.pipeline.store.fragment import read_fragment
 from levelproof.pipeline.store.layout import data_path, data_paths, made_within, new_attempt, unit_name
 from levelproof.pipeline.store.leftovers import disown
 from levelproof.pipeline.store.manifest import (
@@ -21,7 +22,6 @@ from levelproof.pipeline.store.manifest import (
     data_named_by,
     fragment_paths,
     named_by,
-    read_fragment,
     with_places,
     write_fragment,
 )

@@ -15,8 +15,8 @@ import numpy as np
 
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.chunks import CHECKSUM, Chunks, file_name, read_whole
-from levelproof.pipeline.store.contents import ContentsError
 from levelproof.pipeline.store.disk import flush
+from levelproof.pipeline.store.formats import ContentsError
 from levelproof.pipeline.store.remote import at_once, in_order
 from levelproof.pipeline.store.shard import Shard, damaged, reading, stored_bytes
 

@@ -5,10 +5,11 @@ from functools import lru_cache
 from pathlib import Path
 
 from levelproof.pipeline.store.layout import data_path
-from levelproof.pipeline.store.remote import is_remote, stored_at
+from levelproof.pipeline.store.remote import stored_at
 from levelproof.pipeline.store.seed.file import file_of, is_seed, written
 from levelproof.pipeline.store.seed.shard import SeedShard
 from levelproof.pipeline.store.shard import Shard, stored_bytes
+from levelproof.pipeline.urls import is_remote
 
 
 def open_shard(split: Path, name: str, size: str) -> Shard:

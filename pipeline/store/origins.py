@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 
 from levelproof.pipeline.errors import UserError
 from levelproof.pipeline.store.manifest import read_manifest
-from levelproof.pipeline.store.remote import absolute, as_typed
+from levelproof.pipeline.store.remote import absolute
 from levelproof.pipeline.store.seed.file import is_seed
+from levelproof.pipeline.urls import as_typed
 
 ASKED = ("content_hash", "file", "size", "shard", "row")  # columns that `origin_of` needs
 

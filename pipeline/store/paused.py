@@ -42,7 +42,8 @@ from levelproof.pipeline.store.layout import (
 )
 from levelproof.pipeline.store.leases import require_served
 from levelproof.pipeline.store.provenance import device, learned_with, versions
-from levelproof.pipeline.store.remote import as_typed, at_once, is_remote
+from levelproof.pipeline.store.remote import at_once
+from levelproof.pipeline.urls import as_typed, is_remote
 
 MAGIC = b"levelproof checkpoint "  # start of a head
 VERSION = 1  # of the format

@@ -41,8 +41,9 @@ from levelproof.pipeline.store.manifest import (
     write_fragment,
 )
 from levelproof.pipeline.store.objects import Version, get, put, put_if, remove
-from levelproof.pipeline.store.remote import at_once, fragments_in, is_remote
+from levelproof.pipeline.store.remote import at_once, fragments_in
 from levelproof.pipeline.store.scratch import scratch
+from levelproof.pipeline.urls import is_remote
 
 OVER = b"over"  # content of the mark of data that was committed and then superseded
 

@@ -15,8 +15,9 @@ from levelproof.pipeline.store import objects
 from levelproof.pipeline.store.files import remove, write
 from levelproof.pipeline.store.layout import NOTE, QUARANTINE, entries, ids_of, quarantine_path, unit_name
 from levelproof.pipeline.store.leases import require_served
-from levelproof.pipeline.store.remote import at_once, is_remote
+from levelproof.pipeline.store.remote import at_once
 from levelproof.pipeline.store.runs import runs, without
+from levelproof.pipeline.urls import is_remote
 
 MAX_LINE = 2**20  # bytes of a note's first line, which names its levels
 LEVELS = re.compile(r"Levels: ([0-9]{1,12}-[0-9]{1,12}(?:, [0-9]{1,12}-[0-9]{1,12})*)\n")

@@ -18,7 +18,7 @@ from pathlib import Path
 from tempfile import gettempdir, mkdtemp
 
 from levelproof.pipeline.store.machine import boot_id
-from levelproof.pipeline.store.remote import is_remote
+from levelproof.pipeline.urls import is_remote
 
 PREFIX = "levelproof-scratch-"
 LOCK, FILES = "lock", "files"

@@ -18,9 +18,9 @@ import pyarrow as pa
 from levelproof.configs.schema import Density, stored_as
 from levelproof.pipeline.store.bounds import MAX_ROWS
 from levelproof.pipeline.store.checksums import altered
-from levelproof.pipeline.store.contents import ContentsError
 from levelproof.pipeline.store.files import remove
-from levelproof.pipeline.store.formats import Encoding
+from levelproof.pipeline.store.formats import ContentsError, Encoding
+from levelproof.pipeline.store.fragment import Fragment, read_fragment
 from levelproof.pipeline.store.layout import (
     SHARDS,
     Attempt,
@@ -37,20 +37,19 @@ from levelproof.pipeline.store.leases import require_served
 from levelproof.pipeline.store.leftovers import disown, drop
 from levelproof.pipeline.store.manifest import (
     THREADS,
-    Fragment,
     begin_fragment,
     each_once,
     fragment_paths,
     named_by,
-    read_fragment,
     with_places,
     write_fragment,
 )
 from levelproof.pipeline.store.merge import Place, merge_shards
 from levelproof.pipeline.store.publish import publishing
-from levelproof.pipeline.store.remote import at_once, is_remote
+from levelproof.pipeline.store.remote import at_once
 from levelproof.pipeline.store.requests import REQUESTS
 from levelproof.pipeline.store.shard import Shard, read_together, reading, refuse_unlike, write_shard
+from levelproof.pipeline.urls import is_remote
 
 ROWS = 100_000  # rows per sealed fragment, roughly; more: fewer files, but more to rewrite when levels are added
 CONVERTED = 256  # levels in memory at a time when their density changes: 300 MB for size l

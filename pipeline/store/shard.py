@@ -25,7 +25,6 @@ from levelproof.pipeline.store.bounds import DataUnread
 from levelproof.pipeline.store.chunks import Chunks, read_whole
 from levelproof.pipeline.store.contents import (
     FULL,
-    ContentsError,
     blank_row,
     check_numbers,
     level_ids_in,
@@ -36,10 +35,10 @@ from levelproof.pipeline.store.contents import (
 from levelproof.pipeline.store.density import Restored, kept, needed, restored
 from levelproof.pipeline.store.disk import flush
 from levelproof.pipeline.store.fields import same_bits
-from levelproof.pipeline.store.formats import FLAT, SHARD_VERSION, Encoding, FieldSpec, field_table
+from levelproof.pipeline.store.formats import FLAT, SHARD_VERSION, ContentsError, Encoding, FieldSpec, field_table
 from levelproof.pipeline.store.packing import empty, pack, unpack
-from levelproof.pipeline.store.remote import at_once, is_remote, mended, stored_in
-from levelproof.pipeline.urls import quoted
+from levelproof.pipeline.store.remote import at_once, mended, stored_in
+from levelproof.pipeline.urls import is_remote, quoted
 
 FORMAT = "levelproof.shard"
 # What reading untrusted bytes can raise

@@ -16,10 +16,9 @@ from levelproof.pipeline.store.leftovers import clean
 from levelproof.pipeline.store.locks import committing, only_writer
 from levelproof.pipeline.store.manifest import Manifest, changes_text, differences, write_index
 from levelproof.pipeline.store.objects import require_conditions
-from levelproof.pipeline.store.remote import is_remote
 from levelproof.pipeline.store.scratch import written_disk
 from levelproof.pipeline.store.seed.file import is_seed
-from levelproof.pipeline.urls import require_known
+from levelproof.pipeline.urls import is_remote, require_known
 
 
 @contextmanager

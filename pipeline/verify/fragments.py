@@ -11,7 +11,7 @@ import pyarrow as pa
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.bounds import DAMAGE, DataUnread, bounded, unread
 from levelproof.pipeline.store.checksums import has_own
-from levelproof.pipeline.store.manifest import Fragment, read_fragment
+from levelproof.pipeline.store.fragment import Fragment, read_fragment
 from levelproof.pipeline.store.remote import is_listed, stale_index
 from levelproof.pipeline.verify.evidence import COLUMNS
 from levelproof.pipeline.verify.findings import Findings

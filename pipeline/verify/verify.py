@@ -29,6 +29,7 @@ from levelproof.pipeline.runtime import prepare_jax
 from levelproof.pipeline.stopping import stoppable
 from levelproof.pipeline.store.bounds import MAX_ROWS, unread
 from levelproof.pipeline.store.checksums import digests_of
+from levelproof.pipeline.store.fragment import Fragment, read_fragment
 from levelproof.pipeline.store.job_note import JobNote, sound_note
 from levelproof.pipeline.store.layout import (
     BEGUN,
@@ -46,23 +47,14 @@ from levelproof.pipeline.store.layout import (
     unit_ids,
 )
 from levelproof.pipeline.store.locks import is_written
-from levelproof.pipeline.store.manifest import (
-    Fragment,
-    changes_text,
-    differences,
-    fragment_paths,
-    index_of,
-    read_fragment,
-    require_manifest,
-)
+from levelproof.pipeline.store.manifest import changes_text, differences, fragment_paths, index_of, require_manifest
 from levelproof.pipeline.store.named import open_shard
 from levelproof.pipeline.store.origins import RECORD, origin_of
 from levelproof.pipeline.store.progress_bar import ProgressBar, say
-from levelproof.pipeline.store.remote import is_remote
 from levelproof.pipeline.store.runs import runs, runs_text, without
 from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.store.shard import Shard
-from levelproof.pipeline.urls import quoted
+from levelproof.pipeline.urls import is_remote, quoted
 from levelproof.pipeline.verify.cores import BLOCK, Device, Map, on_cores
 from levelproof.pipeline.verify.evidence import Evidence, Recipe, same_stack
 from levelproof.pipeline.verify.findings import Findings, why_not_repaired

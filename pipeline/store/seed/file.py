@@ -20,7 +20,7 @@ from levelproof.pipeline.store.bounds import DAMAGE, Bounded, OtherKind, bounded
 from levelproof.pipeline.store.formats import CONFIG_KEY, HASH_KEY
 from levelproof.pipeline.store.fragment import Fragment, settings_in
 from levelproof.pipeline.store.layout import MANIFEST
-from levelproof.pipeline.store.remote import is_remote, mended
+from levelproof.pipeline.store.remote import mended
 from levelproof.pipeline.store.seed.columns import (
     BUDGET_KEY,
     CONTENT_KEY,
@@ -30,6 +30,7 @@ from levelproof.pipeline.store.seed.columns import (
     SEEDS,
 )
 from levelproof.pipeline.store.seed.packed import MAX_BYTES
+from levelproof.pipeline.urls import is_remote
 
 SUFFIX = ".parquet"
 STORED = "density=seed"

@@ -21,10 +21,11 @@ from levelproof.pipeline.store.bounds import DAMAGE
 from levelproof.pipeline.store.columns import COLUMNS, REPETITIVE, schema_of
 from levelproof.pipeline.store.fragment import Fragment
 from levelproof.pipeline.store.progress_bar import shown_blocks
-from levelproof.pipeline.store.remote import absolute, as_typed, forget
+from levelproof.pipeline.store.remote import absolute, forget
 from levelproof.pipeline.store.seed.columns import KEPT
 from levelproof.pipeline.store.seed.file import SeedFile, damaged_seed, find_levels, read_seed, seed_files
 from levelproof.pipeline.store.seed.source import LevelSource
+from levelproof.pipeline.urls import as_typed
 
 IDENTITIES = ("content_hash", "signature")
 # Manifest column -> columns of the seed file that it is derived from, besides `level_id`, which is always read

@@ -8,11 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax.typing import VariableDict as Params
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from levelproof.experts.networks.entity import EntityNetwork
-from levelproof.experts.policy import Params, forward, initial
+from levelproof.experts.policy import forward, initial
 from levelproof.levelgen.level import SIZES, Level
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.sampling.scenery import empty_level

@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax.typing import VariableDict as Params
 
 from levelproof.experts.networks.flat import FlatNetwork, resting_features
-from levelproof.experts.policy import Params, forward, initial
+from levelproof.experts.policy import forward, initial
 from levelproof.levelgen.level import SIZES
 from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.levelgen.task.observe.flat import dynamic_features, feature_count, level_features

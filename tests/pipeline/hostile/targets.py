@@ -34,14 +34,8 @@ from levelproof.experts.networks.saved import PolicyError
 from levelproof.experts.training.slots import begin
 from levelproof.experts.verdict.judge import KeptExpert
 from levelproof.experts.witness.success import no_success
-from levelproof.levelgen.files.level_file import (
-    LevelFile,
-    LevelFileError,
-    flaws,
-    read_level_file,
-    to_document,
-    write_level_file,
-)
+from levelproof.levelgen.files.entries import LevelFileError
+from levelproof.levelgen.files.level_file import LevelFile, flaws, read_level_file, to_document, write_level_file
 from levelproof.levelgen.identity.keys import MAX_LEVEL_ID
 from levelproof.levelgen.level import size_of
 from levelproof.levelgen.sampling.sampler import sample_levels
@@ -54,9 +48,10 @@ from levelproof.pipeline.store.checkpoints import load_experts, save_experts
 from levelproof.pipeline.store.contents import check_numbers, table_for
 from levelproof.pipeline.store.fields import arrays_of
 from levelproof.pipeline.store.formats import Encoding
+from levelproof.pipeline.store.fragment import read_fragment
 from levelproof.pipeline.store.job_note import NoteError, note_job, read_note
 from levelproof.pipeline.store.layout import BEGUN, DATA, FRAGMENT, JOB, MANIFEST, entries
-from levelproof.pipeline.store.manifest import changes_text, differences, fragment_paths, read_fragment, read_manifest
+from levelproof.pipeline.store.manifest import changes_text, differences, fragment_paths, read_manifest
 from levelproof.pipeline.store.origins import place_of
 from levelproof.pipeline.store.pieces import PieceCache
 from levelproof.pipeline.store.shard import Shard, write_shard

@@ -13,14 +13,9 @@ from rich.console import Console
 from levelproof.pipeline.jobs import repair as repairing
 from levelproof.pipeline.jobs.seal import seal_split
 from levelproof.pipeline.store import mend
+from levelproof.pipeline.store.fragment import read_fragment
 from levelproof.pipeline.store.layout import JOB, WRITER_LOCK, new_attempt
-from levelproof.pipeline.store.manifest import (
-    begin_fragment,
-    fragment_paths,
-    read_fragment,
-    read_manifest,
-    write_fragment,
-)
+from levelproof.pipeline.store.manifest import begin_fragment, fragment_paths, read_manifest, write_fragment
 from levelproof.pipeline.verify.verify import examine
 from tests.pipeline.command import assert_refused, here, run
 from tests.pipeline.made import assert_same_content

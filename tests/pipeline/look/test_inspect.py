@@ -33,8 +33,9 @@ from levelproof.pipeline.read import levels as levels_module
 from levelproof.pipeline.read.select import columns_in
 from levelproof.pipeline.store import manifest
 from levelproof.pipeline.store.columns import COLUMNS
+from levelproof.pipeline.store.fragment import Fragment, read_fragment
 from levelproof.pipeline.store.layout import split_path
-from levelproof.pipeline.store.manifest import Fragment, read_fragment, read_manifest
+from levelproof.pipeline.store.manifest import read_manifest
 from tests.pipeline.made import made_job, made_result, made_split, made_verdict
 
 LABELS = [Label.SOLVED, Label.TRIVIAL, Label.UNSOLVED, Label.UNSOLVABLE]

@@ -10,9 +10,10 @@ from rich.console import Console
 
 from levelproof.configs.schema import Density
 from levelproof.pipeline.jobs.seal import seal_split
+from levelproof.pipeline.store.fragment import read_fragment
 from levelproof.pipeline.store.layout import JOB
 from levelproof.pipeline.store.locks import without_commits
-from levelproof.pipeline.store.manifest import fragment_paths, read_fragment, write_index
+from levelproof.pipeline.store.manifest import fragment_paths, write_index
 from levelproof.pipeline.store.mend import take_out
 from levelproof.pipeline.verify.findings import Findings
 from levelproof.pipeline.verify.verify import examine

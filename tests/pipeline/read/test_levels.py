@@ -12,7 +12,8 @@ from levelproof.experts.labels import Label
 from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.read.levels import COLUMNS, distribution_of, find_level, levels_of, rules_of
 from levelproof.pipeline.store import manifest
-from levelproof.pipeline.store.manifest import Manifest, read_fragment, read_manifest
+from levelproof.pipeline.store.fragment import read_fragment
+from levelproof.pipeline.store.manifest import Manifest, read_manifest
 from tests.pipeline.command import assert_refused, here
 from tests.pipeline.made import made_split
 

@@ -11,7 +11,8 @@ import pytest
 from levelproof.experts.labels import Label
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.checkpoints import load_experts
-from levelproof.pipeline.store.manifest import fragment_paths, read_fragment
+from levelproof.pipeline.store.fragment import read_fragment
+from levelproof.pipeline.store.manifest import fragment_paths
 from levelproof.pipeline.store.shard import Shard
 from tests.pipeline.made import made_job, made_split
 

@@ -18,7 +18,8 @@ import pytest
 from levelproof.experts.labels import Label
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store.columns import COLUMNS, OWN
-from levelproof.pipeline.store.manifest import fragment_paths, read_fragment, read_manifest
+from levelproof.pipeline.store.fragment import read_fragment
+from levelproof.pipeline.store.manifest import fragment_paths, read_manifest
 from levelproof.pipeline.store.thrift import footer_in, pages_in
 from tests.pace import patience
 from tests.pipeline.command import ROOT

@@ -18,7 +18,7 @@ from levelproof.levelgen.sampling.sampler import sample_levels
 from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.store import checkpoints, manifest
 from levelproof.pipeline.store.checkpoints import SourceUnseen, experts_for, load_experts, save_experts
-from levelproof.pipeline.store.manifest import read_fragment
+from levelproof.pipeline.store.fragment import read_fragment
 from tests.pipeline.made import made_job, made_split
 
 UNITS = 3

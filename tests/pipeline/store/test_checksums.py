@@ -10,8 +10,9 @@ import pytest
 
 from levelproof.experts.labels import Label
 from levelproof.pipeline.store.checksums import digests_of, has_own
+from levelproof.pipeline.store.fragment import read_fragment
 from levelproof.pipeline.store.layout import data_path
-from levelproof.pipeline.store.manifest import fragment_paths, read_fragment
+from levelproof.pipeline.store.manifest import fragment_paths
 from tests.pace import patience
 from tests.pipeline.made import made_split
 

@@ -16,13 +16,13 @@ from levelproof.pipeline.errors import Failure, UserError
 from levelproof.pipeline.jobs.unit import manifest_row
 from levelproof.pipeline.store import manifest as manifest_file
 from levelproof.pipeline.store.columns import COLUMNS, MANIFEST_VERSION
+from levelproof.pipeline.store.fragment import read_fragment
 from levelproof.pipeline.store.layout import ids_of, new_attempt, unit_name
 from levelproof.pipeline.store.manifest import (
     begin_fragment,
     changes_text,
     differences,
     fragment_paths,
-    read_fragment,
     read_manifest,
     require_manifest,
     write_fragment,

@@ -38,6 +38,7 @@ from levelproof.pipeline.store.layout import FRAGMENT, MANIFEST, WRITER_LOCK, en
 from levelproof.pipeline.store.leases import is_leased
 from levelproof.pipeline.store.manifest import fragment_paths, read_manifest, require_manifest, write_index
 from levelproof.pipeline.store.split import taken
+from levelproof.pipeline.urls import as_typed, is_remote
 from levelproof.pipeline.verify.verify import examine
 from tests.pace import patience, wait_until
 from tests.pipeline.command import ROOT, assert_refused, line_of
@@ -135,11 +136,11 @@ def data_requests(server: Server) -> list[str]:
 
 def test_paths_represent_urls() -> None:
     for url in ("s3://bucket/data/s", "gs://b", "https://host:80/a", "hf://datasets/user/name@v1/1M/s"):
-        assert remote.is_remote(Path(url))
-        assert remote.as_typed(Path(url)) == url
+        assert is_remote(Path(url))
+        assert as_typed(Path(url)) == url
         assert str(UserError(f"There is no split at {Path(url)}.")) == f"There is no split at {url}."
-    assert not remote.is_remote(Path("data/s"))
-    assert not remote.is_remote(Path())
+    assert not is_remote(Path("data/s"))
+    assert not is_remote(Path())
 
 
 @settings(max_examples=40, deadline=None)

@@ -29,17 +29,12 @@ from levelproof.pipeline.read.rows import read_row
 from levelproof.pipeline.store import manifest
 from levelproof.pipeline.store import seal as sealing
 from levelproof.pipeline.store.bounds import FRAGMENTS, MAX_ROWS, Bounded
+from levelproof.pipeline.store.fragment import read_fragment
 from levelproof.pipeline.store.layout import fragment_of, fragment_path, new_attempt, unit_name
 from levelproof.pipeline.store.leases import LeaseLost
 from levelproof.pipeline.store.leftovers import clean
 from levelproof.pipeline.store.locks import only_writer
-from levelproof.pipeline.store.manifest import (
-    begin_fragment,
-    fragment_paths,
-    read_fragment,
-    read_manifest,
-    write_fragment,
-)
+from levelproof.pipeline.store.manifest import begin_fragment, fragment_paths, read_manifest, write_fragment
 from levelproof.pipeline.store.mend import take_out
 from levelproof.pipeline.store.seal import CROWD, Piece, due, plan, seal
 from levelproof.pipeline.store.shard import Shard
