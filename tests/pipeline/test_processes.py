@@ -19,11 +19,12 @@ from tests.pipeline.command import ROOT
 PREPARED: list[int] = []
 LONG = 600.0  # s
 SLEEP = f"""
-import multiprocessing, time
+import multiprocessing, sys, time
+from pathlib import Path
 from levelproof.pipeline.processes import other_processes
 with other_processes(2) as run:
     run(time.sleep, [{LONG}] * 9)
-    print(*(child.pid for child in multiprocessing.active_children()), flush=True)
+    Path(sys.argv[1]).write_text(" ".join(str(child.pid) for child in multiprocessing.active_children()) + " .")
     time.sleep({LONG})
 """
 
@@ -101,14 +102,15 @@ def test_stop_ends_processes_at_work() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_processes_end_with_a_parent_that_is_killed() -> None:
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    with subprocess.Popen([sys.executable, "-c", SLEEP], env=environment, stdout=subprocess.PIPE, text=True) as parent:
-        assert parent.stdout
-        children = [Path(f"/proc/{word}/cmdline") for word in parent.stdout.readline().split()]
-        assert len(children) == 2
+def test_processes_end_with_a_parent_that_is_killed(tmp_path: Path) -> None:
+    environment, told = os.environ | {"PYTHONPATH": str(ROOT)}, tmp_path / "pids"
+    parent = subprocess.Popen([sys.executable, "-c", SLEEP, str(told)], env=environment)
+    try:
+        *words, _ = wait_until(lambda: told.exists() and told.read_text().split(), 60)
+    finally:
         parent.kill()
-        wait_until(lambda: not any(map(runs, children)), 20)
+    assert len(words) == 2
+    wait_until(lambda: not any(runs(Path(f"/proc/{word}/cmdline")) for word in words), 20)
 
 
 def runs(cmdline: Path) -> bool:
