@@ -18,7 +18,6 @@ from levelproof.pipeline.errors import Failure
 
 GRACE = 3.0  # s for which a process may go on that was told to end: compiled code cannot be interrupted
 
-
 T = TypeVar("T")
 
 

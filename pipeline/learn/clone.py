@@ -151,7 +151,7 @@ def train(
                 with pace.aside():
                     numbers = {COURSE.step: update, "bc/samples_per_second": rate * config.train.batch or np.nan}
                     numbers |= averages("", recent)
-                    if not stops:  # validation may take longer than is left
+                    if update == last or not stops:  # validation may take longer than a stop leaves
                         numbers |= validated(state, held, config)
                         words = f"{line_of(update, last, numbers)}{speed}"
                     recent = []
