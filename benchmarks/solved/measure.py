@@ -20,6 +20,7 @@ from rich.console import Console
 from benchmarks.solved.results import FILE, OF_LEVEL, Header, Results, merge, read
 from benchmarks.solved.variants import Variant
 from levelproof.experts.labels import Label, Verdict
+from levelproof.experts.steps import Totals
 from levelproof.pipeline.errors import Failure, LevelproofError, UserError
 from levelproof.pipeline.jobs.progress import Board, Tally
 from levelproof.pipeline.jobs.schedule import Summary, WorkUnit, plan_units
@@ -37,7 +38,7 @@ class Progress:
     """A process's progress on a unit."""
 
     unit: WorkUnit
-    totals: tuple[int, float, int]  # env steps, levels, solved levels
+    totals: Totals
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from benchmarks.solved.results import Header
 from benchmarks.solved.variants import Variant
 from levelproof.experts.config import RECORD_STEPS, ExpertConfig
 from levelproof.experts.labels import Cause, Label, Source, Verdict
-from levelproof.experts.steps import EnvSteps
+from levelproof.experts.steps import EnvSteps, Totals
 from levelproof.levelgen.level import Level
 from levelproof.pipeline.errors import LevelproofError
 from levelproof.pipeline.jobs.schedule import Summary, WorkUnit
@@ -110,7 +110,7 @@ def train(
         def report(share: float, first: int = first, count: int = len(batch), solved: int = solved) -> None:
             through = first + share * count
             steps = round(through * updates) * config.steps_per_update
-            report_progress(Progress(unit, (steps, known_before + through, solved)))
+            report_progress(Progress(unit, Totals(steps, known_before + through, solved)))
 
         seconds, arrays = train_batch(reference, take(levels, batch), ids[batch], updates, report)
         verdicts = [judged(shown, config, bool(failed[i])) for i, shown in zip(batch, arrays, strict=True)]

@@ -139,26 +139,29 @@ def train(
     with closing(batches), TextBar(console, "reading validation levels", last, first) as bar:
         held = {str(source.data.split): held_of(source, config) for source in sources}
         bar.show(first, "compiling")
-        for update, batch in enumerate(batches, first + 1):
-            state, likeness = imitate(state, batch, config.network, config.train)
-            recent.append(likeness)
-            jax.block_until_ready(likeness)
-            rate, speed = pace.count(1), ""
-            if rate:
-                speed = f" · {rate * config.train.batch:,.0f} samples/s · about {duration((last - update) / rate)} left"
-            words, stops = f"{update:,}/{last:,} updates{speed}", run.stop.is_set()
-            if keep := update % config.interval == 0 or update == last or stops:
-                with pace.aside():
-                    numbers = {COURSE.step: update, "bc/samples_per_second": rate * config.train.batch or np.nan}
-                    numbers |= averages("", recent)
-                    if update == last or not stops:  # validation may take longer than a stop leaves
-                        numbers |= validated(state, held, config)
-                        words = f"{line_of(update, last, numbers)}{speed}"
-                    recent = []
-                    run.keep(state, numbers, "bc/loss", "train.learning_rate")
-            bar.show(update, words, keep=keep)
-            if stops:
-                break
+        with run.stop.heeded():
+            for update, batch in enumerate(batches, first + 1):
+                state, likeness = imitate(state, batch, config.network, config.train)
+                recent.append(likeness)
+                jax.block_until_ready(likeness)
+                rate, speed = pace.count(1), ""
+                if rate:
+                    speed = (
+                        f" · {rate * config.train.batch:,.0f} samples/s · about {duration((last - update) / rate)} left"
+                    )
+                words, stops = f"{update:,}/{last:,} updates{speed}", run.stop.asked.is_set()
+                if keep := update % config.interval == 0 or update == last or stops:
+                    with pace.aside():
+                        numbers = {COURSE.step: update, "bc/samples_per_second": rate * config.train.batch or np.nan}
+                        numbers |= averages("", recent)
+                        if update == last or not stops:  # validation may take longer than a stop leaves
+                            numbers |= validated(state, held, config)
+                            words = f"{line_of(update, last, numbers)}{speed}"
+                        recent = []
+                        run.keep(state, numbers, "bc/loss", "train.learning_rate")
+                bar.show(update, words, keep=keep)
+                if stops:
+                    break
     return state
 
 

@@ -196,7 +196,7 @@ def update_until_done(
     """
     last, first = config.train.updates, int(now.imitation.updates)
     pace = Pace()
-    with TextBar(console, "compiling", last, first) as bar:
+    with TextBar(console, "compiling", last, first) as bar, run.stop.heeded():
         for update in range(first, last, config.interval):
             bar.show(update, f"{update:,}/{last:,} updates · asking teachers")
             number = update // config.interval
@@ -218,7 +218,7 @@ def update_until_done(
                 words += f" · about {duration((last - until) / rate)} left"
             run.keep(now, numbers, "distill/loss", "train.learning_rate")
             bar.show(until, words, keep=True)
-            if run.stop.is_set():
+            if run.stop.asked.is_set():
                 break
     return now
 

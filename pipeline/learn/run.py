@@ -1,6 +1,5 @@
 """A training run under way: the metrics, checkpoints and policy that `clone`, `train` and `distill` write."""
 
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from levelproof.pipeline.learn.folder import (
     writing_run,
 )
 from levelproof.pipeline.learn.metrics import Metrics
-from levelproof.pipeline.stopping import stoppable
+from levelproof.pipeline.stopping import Stop, stoppable
 
 T = TypeVar("T")
 
@@ -36,7 +35,7 @@ class Run(Generic[T]):
     policy_of: Callable[[dict[str, Any], T], Policy]
     note: dict[str, Any]  # in the folder
     trained: dict[str, Any]  # replaces the note once an update is saved
-    stop: threading.Event  # set once the run is to end after its next save
+    stop: Stop  # heeded while updates are taken: the run ends after the next save
 
     def save(self, state: T) -> Policy:
         """Write the checkpoint, then the policy; return the policy. Raises as `keep_run` and `require_ours`."""
@@ -112,11 +111,10 @@ def make_policy(
         trained = with_stack(note, tell) if trains else note
         write_note(out, note)
         with Metrics(out, curves, log if trains else "none", trained, steps, tell, require_ours) as metrics:
-            run = Run(out, metrics, require_ours, policy_of, note, trained, stop.asked)
+            run = Run(out, metrics, require_ours, policy_of, note, trained, stop)
             if trains:
                 try:
-                    with stop.heeded():
-                        state = advance(run)
+                    state = advance(run)
                 except KeyboardInterrupt:
                     tell(f"Stopped: the same command continues the run in {out}.")
                     raise

@@ -169,7 +169,7 @@ def update_until_done(
     last, first, per_update = recipe.ppo.updates, int(learner.updates), recipe.ppo.steps_per_update
     pace, recent = Pace(), []
     every = recipe.curriculum.every
-    with TextBar(console, "compiling", last, first) as bar:
+    with TextBar(console, "compiling", last, first) as bar, run.stop.heeded():
         for update in range(first + 1, last + 1):
             if every and (update - 1) % every == 0:
                 learner = programs.between_updates(learner, table)
@@ -181,7 +181,7 @@ def update_until_done(
                 words += f" · {solved:.1%} solved"
             if rate:
                 words += f" · {rate:,.0f} env steps/s · about {duration((last - update) * per_update / rate)} left"
-            stops = run.stop.is_set()
+            stops = run.stop.asked.is_set()
             if keep := update % interval == 0 or update == last or stops:
                 with pace.aside():
                     numbers = {COURSE.step: update * per_update, "train/updates": update} | averages(recent)

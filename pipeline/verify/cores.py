@@ -1,10 +1,11 @@
 """The cores that a verification uses: one process each, if there are levels enough."""
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any, Literal, NamedTuple
 
 from levelproof.levelgen.sampling.sampler import CHUNK
+from levelproof.pipeline.errors import Failure
 from levelproof.pipeline.processes import other_processes
 from levelproof.pipeline.runtime import jax_sees_a_gpu, own_cores, prepare_jax
 
@@ -27,11 +28,12 @@ def on_cores(rows: int, device: Device) -> Iterator[Cores]:
     """Yield as many processes as there are cores and `rows` is worth; this one if that is one, or for a GPU.
 
     Raises:
-        Failure: a process died, or cannot be started.
+        Failure: a process died.
     """
     count = 1 if jax_sees_a_gpu() else min(len(own_cores()), rows // LEAST)
-    if count <= 1:
-        yield Cores(1, map)
-        return
-    with other_processes(count, prepare_jax, None, device) as run:
-        yield Cores(count, run)
+    cores = Cores(1, map)
+    with ExitStack() as stack:
+        if count > 1:
+            with suppress(Failure):  # this machine cannot start others
+                cores = Cores(count, stack.enter_context(other_processes(count, prepare_jax, None, device)))
+        yield cores

@@ -7,7 +7,7 @@ must match its row's content hash, and its witness must reach the goal.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from contextlib import suppress
 from functools import partial
 from itertools import islice
@@ -215,7 +215,7 @@ def _check_fragments(
     named = (
         {name: shards[name] for name in block.column("shard").unique().drop_null().to_pylist()} for block in blocks
     )
-    for found in run(partial(_examined_block, recipe, findings.changed), blocks, named):
+    for found in run(partial(_examined_block, recipe, frozenset(findings.changed)), blocks, named):
         findings.include(found)
         progress.advance(found.levels)
     for name, level_ids in {**in_shards, **in_experts}.items():
@@ -231,7 +231,7 @@ def _check_fragments(
     _keep_commands(parts, findings)
 
 
-def _examined_block(recipe: Recipe, changed: set[str], rows: pa.Table, shards: dict[str, Shard | None]) -> Findings:
+def _examined_block(recipe: Recipe, changed: Set[str], rows: pa.Table, shards: dict[str, Shard | None]) -> Findings:
     """Examine rows, perhaps in another process; `changed`: as in `Findings`, so far."""
     findings = Findings(changed={*changed})
     for first in range(0, rows.num_rows, CHUNK):
