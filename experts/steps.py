@@ -21,9 +21,9 @@ class EnvSteps(NamedTuple):
 class Totals(NamedTuple):
     """Progress of some levels."""
 
-    env_steps: int = 0
-    levels: float = 0.0  # decided; a level in training counts as the share of its budget used
-    solved: int = 0
+    env_steps: int
+    levels: float  # decided; a level in training counts as the share of its budget used
+    solved: int
 
 
 class Seconds(NamedTuple):

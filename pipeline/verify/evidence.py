@@ -23,7 +23,7 @@ from levelproof.levelgen.batching import LANES
 from levelproof.levelgen.identity.content import VERSION, content_hashes, level_id_for
 from levelproof.levelgen.identity.signature import signatures
 from levelproof.levelgen.level import Level, size_of
-from levelproof.levelgen.sampling.sampler import Distribution, sample_levels
+from levelproof.levelgen.sampling.sampler import CHUNK, Distribution, sample_levels
 from levelproof.levelgen.sampling.scenery import empty_level
 from levelproof.levelgen.task.rules import TaskParams
 from levelproof.physics.step import ENGINE_VERSION
@@ -59,6 +59,12 @@ class Recipe:
     size: str
     distribution: Distribution | None  # None: levels come from shards or files, not from ids
     rules: TaskParams
+
+
+def examine_rows(rows: pa.Table, recipe: Recipe, shards: dict[str, Shard | None], findings: Findings) -> None:
+    """Run all checks of rows, as many at once as the sampler's program takes. Arguments as of `Evidence`."""
+    for first in range(0, rows.num_rows, CHUNK):
+        Evidence(rows.slice(first, CHUNK), recipe, shards, findings).examine()
 
 
 class Evidence:

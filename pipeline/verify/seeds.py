@@ -17,7 +17,7 @@ from levelproof.pipeline.store.seed.file import STORED, describe_seed, missing_s
 from levelproof.pipeline.store.seed.source import LevelSource
 from levelproof.pipeline.store.seed.write import content_digest
 from levelproof.pipeline.verify.cores import Device, Map, on_cores
-from levelproof.pipeline.verify.evidence import COLUMNS, Evidence, Recipe
+from levelproof.pipeline.verify.evidence import COLUMNS, Recipe, examine_rows
 from levelproof.pipeline.verify.findings import Findings
 
 READ = 16 * CHUNK  # rows read together: to read any of a row group decompresses all of it
@@ -74,6 +74,5 @@ def _examined_block(recipe: Recipe, level_ids: np.ndarray) -> tuple[Findings, li
     findings, path = Findings(), recipe.split
     rows = read_manifest(path, ["level_id", *COLUMNS], level_ids).table
     shard = open_shard(path, path.name, recipe.size)
-    for first in range(0, rows.num_rows, CHUNK):
-        Evidence(rows.slice(first, CHUNK), recipe, {path.name: shard}, findings).examine()
+    examine_rows(rows, recipe, {path.name: shard}, findings)
     return findings, rows.column("content_hash").to_pylist()

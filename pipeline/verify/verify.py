@@ -21,7 +21,6 @@ from rich.console import Console
 
 from levelproof.configs.schema import distribution_in, from_files, other_sampler, rules_in
 from levelproof.levelgen.level import size_of
-from levelproof.levelgen.sampling.sampler import CHUNK
 from levelproof.pipeline.errors import Exit, Failure
 from levelproof.pipeline.read.level_files import level_at
 from levelproof.pipeline.read.levels import recorded_settings
@@ -56,7 +55,7 @@ from levelproof.pipeline.store.seed.file import is_seed
 from levelproof.pipeline.store.shard import Shard
 from levelproof.pipeline.urls import is_remote, quoted
 from levelproof.pipeline.verify.cores import BLOCK, Device, Map, on_cores
-from levelproof.pipeline.verify.evidence import Evidence, Recipe, same_stack
+from levelproof.pipeline.verify.evidence import Recipe, examine_rows, same_stack
 from levelproof.pipeline.verify.findings import Findings, why_not_repaired
 from levelproof.pipeline.verify.fragments import FragmentGroup, Part, grouped, rows_in
 from levelproof.pipeline.verify.seeds import examine_seeds
@@ -234,8 +233,7 @@ def _check_fragments(
 def _examined_block(recipe: Recipe, changed: Set[str], rows: pa.Table, shards: dict[str, Shard | None]) -> Findings:
     """Examine rows, perhaps in another process; `changed`: as in `Findings`, so far."""
     findings = Findings(changed={*changed})
-    for first in range(0, rows.num_rows, CHUNK):
-        Evidence(rows.slice(first, CHUNK), recipe, shards, findings).examine()
+    examine_rows(rows, recipe, shards, findings)
     return findings
 
 
